@@ -105,7 +105,6 @@ impl Ring {
     }
 }
 
-/// A line, truncated at its capacity.
 struct LineBuffer(String<{ MAX_LINE - 1 }>);
 
 impl Write for LineBuffer {

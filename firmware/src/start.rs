@@ -186,7 +186,6 @@ pub(crate) struct Tasks {
 type BoardWatch = watchdog::TaskWatch<MAX_TASKS>;
 
 impl Tasks {
-    /// Starts a task with its pulse.
     pub(crate) fn spawn<S>(
         &self,
         name: TaskName,
@@ -253,7 +252,6 @@ fn wire(len: usize, gateway: &Gateway, config: &GatewayConfig, wiring: &mut Wiri
     );
 }
 
-/// Starts the tasks of the field ports.
 #[inline(never)]
 fn run_ports(
     tasks: &Tasks,
@@ -470,7 +468,6 @@ async fn watch_button(pulse: &'static Pulse, console: &'static Console, button: 
     pulse.run(pin!(console.watch(pulse, button))).await
 }
 
-/// Publishes the state of the gateway to a broker.
 #[embassy_executor::task]
 async fn edge_node(
     pulse: &'static Pulse,
@@ -484,7 +481,6 @@ async fn edge_node(
     pulse.run(pin!(node.run(gateway, pulse, stack, store, view.edge, view.clock, buffers))).await
 }
 
-/// Queries a server for UTC.
 #[embassy_executor::task]
 async fn time_server(
     pulse: &'static Pulse,
@@ -497,7 +493,6 @@ async fn time_server(
     pulse.run(pin!(time::run(pulse, stack, (host, port), clock, seed))).await
 }
 
-/// Logs the board's address whenever it changes.
 #[embassy_executor::task]
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
     let log = async {

@@ -28,7 +28,6 @@ impl<P: Peripheral> TestDevice<P> {
         self.now.get()
     }
 
-    /// Level of its interrupt line.
     pub(crate) fn interrupt_line(&self) -> bool {
         self.with(|model| model.interrupt_line())
     }
@@ -38,14 +37,12 @@ impl<P: Peripheral> TestDevice<P> {
         f(&mut self.model.borrow_mut())
     }
 
-    /// A read of a register by the driver.
     #[track_caller]
     pub(crate) fn read(&self, offset: u32) -> u32 {
         let read = self.access(|model, at| model.read(offset, at));
         read.unwrap_or_else(|refusal| panic!("{} is read: {refusal}", self.name(offset)))
     }
 
-    /// A write of a register by the driver.
     #[track_caller]
     pub(crate) fn write(&self, offset: u32, value: u32) {
         let written = self.access(|model, at| model.write(offset, value, at));

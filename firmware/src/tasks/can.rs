@@ -66,7 +66,6 @@ struct CanTask<'a, C> {
     is_failing: bool,
     /// Wait after the next bus-off.
     backoff: Duration,
-    /// Time of the last recovery.
     recovered: Instant,
     /// Lost frames reported by the last log line, and its time.
     lost: u32,
@@ -129,7 +128,6 @@ impl<C: CanPort> CanTask<'_, C> {
         }
     }
 
-    /// Transmits the engine's frames.
     async fn send_waiting(&mut self) {
         let mut frames = 0_u32;
         while let Some(frame) = self.control.next_frame() {
@@ -227,7 +225,6 @@ impl<C: CanPort> CanTask<'_, C> {
     }
 }
 
-/// Converts a frame of the driver.
 fn to_core(frame: &impl Frame) -> Option<CanFrame> {
     let id = CanId::from(frame.id());
     if frame.is_remote_frame() {

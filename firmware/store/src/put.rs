@@ -21,7 +21,6 @@ pub struct Put<'s, 'd> {
     work: Work,
 }
 
-/// State of writing a record.
 #[derive(Debug)]
 pub(crate) struct Work {
     head: RecordHead,
@@ -116,7 +115,6 @@ enum PutPhase {
     End(Result<(), PutError>),
 }
 
-/// Progress of writing a record.
 #[derive(Debug, Clone, Copy)]
 enum WordWriter {
     Head,
@@ -134,7 +132,6 @@ enum WriteProgress {
     Worn,
 }
 
-/// Source of a record's data.
 pub(crate) enum RecordSource<'d, F> {
     Bytes(&'d [u8]),
     Flash(&'d F, FoundRecord),
@@ -151,7 +148,6 @@ impl<F: Flash> RecordSource<'_, F> {
     }
 }
 
-/// The sector that a record is written to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum PutTarget {
     Filled,
@@ -406,7 +402,6 @@ impl Work {
     }
 }
 
-/// Whether all words of a sector look blank.
 pub(crate) fn is_blank(flash: &impl Flash, sector: u8) -> bool {
     (0..flash.geometry().words).all(|word| flash.read(FlashWord { sector, word }) == BLANK)
 }

@@ -107,7 +107,6 @@ impl RecordHead {
         ])
     }
 
-    /// Number of words of the record.
     pub(crate) fn extent(&self) -> u16 {
         extent(self.len as usize)
     }
@@ -148,7 +147,6 @@ impl SectorHead {
     }
 }
 
-/// Builds a head word with its CRC.
 fn finished(parts: [[u8; 4]; 7]) -> Word {
     let mut word = [0; WORD];
     for (place, byte) in word.iter_mut().zip(parts.as_flattened()) {
@@ -180,7 +178,6 @@ pub(crate) fn part(data: &[u8], nth: u16) -> Word {
     word
 }
 
-/// CRC of the data as it is stored.
 pub(crate) fn sum(data: &[u8]) -> u32 {
     let mut digest = digest();
     for nth in 0..extent(data.len()).saturating_sub(2) {

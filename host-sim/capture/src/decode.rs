@@ -39,7 +39,6 @@ pub struct Topic {
     /// A JSON Schema of its values.
     pub schema: Value,
     format: Format,
-    /// The name of each element that has one.
     names: Vec<Option<String>>,
 }
 

@@ -59,9 +59,6 @@ pub struct Recording {
 
 impl Recording {
     /// Begins to record what `watch` tells; call it before the gateway starts, so that its run can be replayed.
-    ///
-    /// # Errors
-    /// If the folder cannot be made or read.
     pub fn start(watch: &Watch, options: RecordOptions) -> io::Result<Self> {
         let folder = Folder::open(&options.folder)?;
         let subscription = watch.subscribe(Interest { frames: true, passes: true }, ROOM);

@@ -229,7 +229,6 @@ pub(super) struct Recorder {
     now: Instant,
 }
 
-/// The states that were last reported.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct ReportedStates {
     robot: RobotState,
@@ -239,7 +238,6 @@ struct ReportedStates {
     speed: f32,
 }
 
-/// The values before a write.
 pub(super) struct Before {
     image: Box<[u8; IMAGE_BYTES]>,
     analog: ([u16; 8], [u16; 2]),

@@ -24,7 +24,6 @@ pub(crate) enum AnswerText {
 }
 
 impl Answer {
-    /// An answer without trouble.
     pub(crate) fn new(document: Value, text: String) -> Self {
         Self { document, text: AnswerText::Made(text), row: Vec::new(), verdict: Verdict::Well }
     }

@@ -30,9 +30,6 @@ pub struct Configuration {
 impl Configuration {
     /// Reads a gateway file, with overrides that only a board takes, or an image, which only a board takes too. With a
     /// board, it must fit that one.
-    ///
-    /// # Errors
-    /// Its first mistake, with its place.
     pub fn read(path: &Path, set: &[String], board: Option<Board>) -> Result<Self, Failure> {
         let name = path.display().to_string();
         let whole = |why: String| FileError {
@@ -89,7 +86,6 @@ impl Configuration {
     }
 }
 
-/// Whether an address is a loopback address.
 fn is_this_machine(address: &str) -> bool {
     address == "localhost" || address.parse::<IpAddr>().is_ok_and(|ip| ip.to_canonical().is_loopback())
 }
@@ -106,7 +102,6 @@ fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
 /// What takes a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ServerRole {
-    /// A gateway on a host.
     Host,
     Board,
 }
@@ -135,9 +130,6 @@ pub enum Stored {
 }
 
 /// The configuration that runs, or another one that is kept.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn stored(client: &Client, revision: Option<u32>) -> Result<Stored, Failure> {
     let path = revision.map_or_else(|| "config".to_owned(), |number| format!("config?revision={number}"));
     let reply = client.get(&path)?;
@@ -158,9 +150,6 @@ impl Stored {
     }
 
     /// The configuration itself, as far as it says what runs: overrides of the command line are not in it.
-    ///
-    /// # Errors
-    /// If it is no configuration that this program reads.
     pub fn read(&self) -> Result<Box<GatewayConfig>, String> {
         match self {
             Self::Toml(toml) => {
@@ -173,9 +162,6 @@ impl Stored {
 }
 
 /// `config` without a file to write to.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure> {
     let stored = stored(client, revision)?;
     let len = TableCell::number(stored.bytes().len());
@@ -210,9 +196,6 @@ pub struct TrialOptions {
 }
 
 /// `push`: stores a configuration, and puts it on trial if that is asked for.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn push(
     client: &Client,
     configuration: &Configuration,
@@ -241,7 +224,6 @@ pub fn push(
     Ok(Answer::new(document, text).with_row(row))
 }
 
-/// An ETag as it may stand in a head.
 fn is_etag(text: &str) -> bool {
     text.len() <= 64 && text.bytes().all(|byte| byte.is_ascii_graphic())
 }
@@ -326,9 +308,6 @@ fn until(
 }
 
 /// `confirm`.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn confirm(client: &Client) -> Result<Answer, Failure> {
     let reply = client.accepted(client.call(&Call::post("confirm", &json!({})))?)?;
     let document = client.document(&reply)?;
@@ -348,9 +327,6 @@ pub enum WithoutTrial {
 
 /// `rollback`. The API steps back to the revision before if there is no trial, which is not what somebody wants who
 /// takes back a trial that has just ended by itself: so this looks first.
-///
-/// # Errors
-/// If it is refused, here or there, or not reached.
 pub fn rollback(client: &Client, without: WithoutTrial) -> Result<Answer, Failure> {
     if without == WithoutTrial::Refuse {
         let document = client.json("revisions")?;
@@ -396,9 +372,6 @@ fn no_trial(revisions: &Value) -> String {
 }
 
 /// `identify`: a host writes a line, a board blinks its LED.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn identify(client: &Client, seconds: u32) -> Result<Answer, Failure> {
     let arguments = json!({ "s": seconds });
     let reply = client.accepted(client.call(&Call::post("identify", &arguments))?)?;

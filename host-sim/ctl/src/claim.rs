@@ -96,5 +96,4 @@ fn wait(client: &Client, info: &Value, name: &str, tell: &mut dyn FnMut(&str)) -
 const WINDOW: Duration = Duration::from_secs(60);
 /// A key that is sent later than this before the end of the board's own minute might come too late.
 const MIN_LEFT_S: f64 = 1.0;
-/// Time between two looks.
 const AGAIN: Duration = Duration::from_millis(500);

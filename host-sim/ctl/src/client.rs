@@ -107,14 +107,12 @@ impl Client {
         Self { host, ..self }
     }
 
-    /// The same gateway, until another end.
     pub(crate) fn until(&self, stop: Stop) -> Self {
         let (address, places, key) = (self.address.clone(), self.places.clone(), self.key.clone());
         let (host, timeout) = (self.host.clone(), self.timeout);
         Self { address, places, host, key, timeout, stop, nonce: RefCell::new(None) }
     }
 
-    /// The same gateway with another key.
     pub(crate) fn with_key(&self, key: Key) -> Self {
         Self { key: Some(key), ..self.until(self.stop.clone()) }
     }
@@ -148,7 +146,6 @@ impl Client {
         }
     }
 
-    /// An answer to a plain read.
     pub(crate) fn get(&self, path: &str) -> Result<HttpReply, Failure> {
         let reply = self.call(&Call::get(path))?;
         self.accepted(reply)
@@ -162,13 +159,11 @@ impl Client {
         }
     }
 
-    /// A body as JSON.
     pub(crate) fn document(&self, reply: &HttpReply) -> Result<Value, Failure> {
         serde_json::from_slice(&reply.body)
             .map_err(|_| self.refused("the answer is no JSON; is this a gateway?"))
     }
 
-    /// A body as text.
     pub(crate) fn text(&self, reply: HttpReply) -> Result<String, Failure> {
         String::from_utf8(reply.body).map_err(|_| self.refused("the answer is no text; is this a gateway?"))
     }
@@ -200,7 +195,6 @@ impl Client {
         self.opened(exchange).map(Some)
     }
 
-    /// Makes a request; any answer is one.
     pub(crate) fn call(&self, call: &Call<'_>) -> Result<HttpReply, Failure> {
         self.asked_again(call, || Ok(self.exchange(call)?.finish()?))
     }
@@ -387,7 +381,6 @@ const ATTEMPTS: u32 = 6;
 /// Between two of them.
 const AGAIN: Duration = Duration::from_millis(200);
 
-/// The events of a gateway.
 #[derive(Debug)]
 pub(crate) struct EventStream<'a> {
     client: &'a Client,

@@ -43,7 +43,6 @@ pub fn set(client: &Client, settings: &[u8], from: From) -> Result<Answer, Failu
     }
 }
 
-/// The document once the board has started again.
 fn restarted(client: &Client) -> Result<Value, Failure> {
     let deadline = Instant::now() + RESTARTING;
     loop {
@@ -100,5 +99,4 @@ fn answer(document: Value) -> Answer {
 
 /// How long a board may take to start again.
 const RESTARTING: Duration = Duration::from_secs(30);
-/// Time between two looks.
 const AGAIN: Duration = Duration::from_millis(200);

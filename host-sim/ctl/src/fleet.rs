@@ -153,9 +153,6 @@ fn ask_batch(
 
 impl Outcomes {
     /// Whether all have answered, and whether all is well with them; a failure names those that have not.
-    ///
-    /// # Errors
-    /// If one has failed.
     pub fn verdict(&self) -> Result<Verdict, Failure> {
         let failed = self.0.iter().filter(|(_, outcome)| !matches!(outcome, MemberOutcome::Answered(_)));
         let names: Vec<_> = failed.map(|(name, _)| name.as_str()).collect();

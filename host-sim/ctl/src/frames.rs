@@ -15,7 +15,6 @@ use serde_json::{Map, Value};
 use crate::reading::number;
 use crate::shown;
 
-/// The data of an event.
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct FramesDocument {
     pub(crate) frames: Vec<FrameDocument>,
@@ -26,7 +25,6 @@ pub(crate) struct FramesDocument {
 
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct FrameDocument {
-    /// On the gateway's clock.
     pub(crate) time_us: u64,
     /// The field port that it was at.
     pub(crate) port: String,
@@ -56,7 +54,6 @@ enum Direction {
 }
 
 impl FrameDocument {
-    /// Whether it came in.
     pub(crate) fn is_in(&self) -> bool {
         self.direction == Direction::In
     }

@@ -17,9 +17,6 @@ pub(crate) struct Seed(pub(crate) [u8; 32]);
 
 /// Makes a key: the private one in a new file of mode 0600, the public one in another whose name ends in `.pub`.
 /// Returns the digits of the public one, and the name of its file.
-///
-/// # Errors
-/// One of the files exists, or cannot be written.
 pub fn make(path: &Path) -> Result<(String, PathBuf), Failure> {
     let public_path = beside(path);
     // Before anything is made: a private key without its public one would have to be deleted by hand.
@@ -33,7 +30,6 @@ pub fn make(path: &Path) -> Result<(String, PathBuf), Failure> {
     Ok((public, public_path))
 }
 
-/// Reads a private key.
 pub(crate) fn read(path: &Path) -> Result<Seed, Failure> {
     parse(&digits::read(path)?).map(Seed).ok_or_else(|| {
         wrong(path, &"not 64 hexadecimal digits; `host-sim ctl keygen --signing FILE` makes a key")

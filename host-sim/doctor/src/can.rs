@@ -113,7 +113,6 @@ fn other_kind<'a>(foreign: &[&'a SeenId], recipe_ids: &[CanId]) -> Option<(&'a S
     })
 }
 
-/// Frames of the right id and another length.
 fn length(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
     let one = seen.record.ids().iter().find(|one| recipe_ids.contains(&one.id))?;
     let Parts::Can { input, .. } = &seen.recipe.parts else { return None };

@@ -10,7 +10,6 @@ use crate::finding::{Cause, Finding, Severity};
 use crate::port_case::PortCase;
 use crate::state::Withheld;
 
-/// Looks at a port whose device gives commands.
 pub(crate) fn examine(seen: &PortCase<'_>, findings: &mut Vec<Finding>) {
     if !gives_commands(seen.case.config, seen.recipe) {
         return;

@@ -8,7 +8,6 @@ use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
 use crate::record::{LinkFacts, Reach};
 use crate::state;
 
-/// Looks at each link.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     for info in &case.status.links {
         // What the second connection to port 2000 lacks, the first carries.

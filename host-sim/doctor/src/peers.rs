@@ -10,7 +10,6 @@ use crate::finding::{Cause, Finding, Severity};
 use crate::port_case::PortCase;
 use crate::state::Peer;
 
-/// Looks at each peer.
 pub(crate) fn examine(seen: &PortCase<'_>, findings: &mut Vec<Finding>) {
     let exchanges = seen.case.config.exchanges_of(seen.recipe);
     let is_served =

@@ -13,7 +13,6 @@ use crate::shape::Shape;
 use crate::stream::{self, Fit};
 use crate::{Case, can, checksum, given, peers, value};
 
-/// Looks at each field port.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     for status in &case.status.ports {
         let found = case.config.field_ports().find(|(index, ..)| PortId(*index) == status.id);
@@ -173,7 +172,6 @@ impl PortCase<'_> {
         )
     }
 
-    /// Frames that were found and rejected.
     fn rejected(&self, shape: &Shape<'_>, bytes: &[u8]) -> Option<Finding> {
         let counters = &self.counters;
         let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
@@ -413,7 +411,6 @@ impl PortCase<'_> {
         }
     }
 
-    /// A piece of a frame, and nothing since.
     fn broken_off(&self, shape: &Shape<'_>) -> Option<Finding> {
         let last = self.status.rejection.as_ref();
         let last = last.filter(|last| last.why == Rejection::Partial && last.age < REPORTED_FOR)?;
@@ -512,7 +509,6 @@ impl PortCase<'_> {
     }
 }
 
-/// A few bytes to show.
 fn first(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(SHOWN)]
 }

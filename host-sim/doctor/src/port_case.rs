@@ -20,7 +20,6 @@ pub(crate) struct PortCase<'a> {
 }
 
 impl PortCase<'_> {
-    /// Makes a finding about the port.
     pub(crate) fn found(
         &self,
         severity: Severity,

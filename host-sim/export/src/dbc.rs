@@ -78,9 +78,6 @@ impl From<Collision> for DbcError {
 }
 
 /// The database of all CAN ports, or of the one called `port`.
-///
-/// # Errors
-/// [`DbcError`].
 pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
     let can = || model.ports.iter().filter(|port| matches!(port.bus, BusModel::Can { .. }));
     let known = || can().map(|port| port.name.clone()).collect::<Vec<_>>();
@@ -102,7 +99,6 @@ pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
     Ok(writer.finish(&ports))
 }
 
-/// All frames with one id.
 struct DbcMessage<'m> {
     id: CanId,
     recipe: &'m str,
@@ -183,7 +179,6 @@ impl DbcWriter {
         }
     }
 
-    /// The node at the other end of a port.
     fn device(&mut self, port: &PortModel) -> Result<String, Collision> {
         self.nodes.add(&format!("{}-device", port.name))
     }
@@ -261,7 +256,6 @@ impl DbcWriter {
         Ok(())
     }
 
-    /// The signals of one frame.
     fn signals(
         &mut self,
         scope: &mut Scope,
@@ -365,7 +359,6 @@ impl DbcWriter {
     }
 }
 
-/// The signals of one message.
 struct Scope {
     id: u32,
     receiver: String,

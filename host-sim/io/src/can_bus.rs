@@ -89,9 +89,6 @@ impl CanBus {
     }
 
     /// Advances the bus with the clock until dropped.
-    ///
-    /// # Errors
-    /// As [`Clock::alarm`] and [`Alarm::expired`](crate::clock::Alarm::expired).
     pub async fn run(&self) -> io::Result<()> {
         let timer = self.shared.clock.alarm()?;
         loop {
@@ -146,9 +143,6 @@ pub struct BusNode {
 
 impl BusNode {
     /// Queues a frame for transmission.
-    ///
-    /// # Errors
-    /// [`Full`] if too many wait.
     pub fn send(&self, now: Instant, frame: CanFrame) -> Result<(), Full> {
         let wire = &self.bus.shared.wire;
         self.bus.advance(now);
@@ -229,7 +223,6 @@ pub(super) struct CanPort {
     bitrate: u32,
     pacing: Pacing,
     tx: Rc<PortTx>,
-    /// The clock of the bus.
     pub(super) clock: Clock,
 }
 

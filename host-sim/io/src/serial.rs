@@ -27,7 +27,6 @@ use crate::fairness::{Either, Order, either, give_way, yield_fairly};
 use crate::tcp_options;
 use crate::timer::now;
 
-/// A serial port's device.
 #[derive(Debug)]
 pub(super) struct SerialPort {
     source: SerialSource,
@@ -284,7 +283,6 @@ enum Other {
     Slept,
     /// Received bytes are requested from the driver.
     Looked,
-    /// There is something to send.
     HandedOver,
     /// The transmission can go on.
     Due(io::Result<()>),

@@ -99,9 +99,6 @@ impl Wire {
     }
 
     /// Queues a frame. Call [`Wire::poll`] after it.
-    ///
-    /// # Errors
-    /// See [`Full`].
     pub fn send(&mut self, now: Instant, node: NodeId, frame: CanFrame) -> Result<(), Full> {
         let queue = self.nodes.get_mut(&node).filter(|queue| queue.len() < MAX_QUEUED).ok_or(Full)?;
         queue.push_back(QueuedFrame { since: now, frame });

@@ -313,7 +313,6 @@ impl Core {
         }
     }
 
-    /// Reports one input and executes all outputs.
     fn input(&self, input: Input<'_>) {
         let at = now();
         trace!(input = %TraceText(&input), "in");
@@ -446,9 +445,6 @@ fn lift(outer: &mut Value, key: &str) {
 
 /// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP. All records for [`RunOptions::watch`] are delivered when this
 /// returns.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), RunError> {
     let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
@@ -459,17 +455,11 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), RunError> {
 }
 
 /// Starts the gateway on a thread of its own; dropping the handle ends it.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
     start_watched(config, binds, &Watch::new())
 }
 
 /// As [`start`], with records for the subscribers of `watch`, which can be reused for the next gateway.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, RunError> {
     let observers = Observers { watch: watch.clone(), ..Observers::default() };
     spawn(config, binds, Scheduling::Ordinary, observers, Handover::default(), &RuntimePlace::alone())

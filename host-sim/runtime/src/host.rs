@@ -62,7 +62,6 @@ pub(crate) trait ForegroundRun {
     fn stats(&self) -> Option<Value>;
     /// Clients of all threads that move data; empty if one of them does not run at the moment.
     fn clients(&self) -> Vec<RuntimeClient>;
-    /// Whether it has ended by itself.
     fn has_ended(&self) -> bool;
     /// Ends it and waits until it has ended. If it had ended by itself, returns the reason as the error.
     fn shutdown(self: Box<Self>) -> Result<(), RunError>;
@@ -134,7 +133,6 @@ fn alone<S: Runtime>(name: &str, opening: Opening<S>) -> Result<JoinHandle<Resul
     thread.map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
 }
 
-/// A runtime to be opened.
 struct Opening<S> {
     open: Open<S>,
     opened: blocking::Sender<Result<Value, RunError>>,

@@ -211,7 +211,6 @@ impl Drop for Lent<'_> {
     }
 }
 
-/// The context of a link's task.
 struct LinkTask<'a> {
     name: &'a str,
     control: &'a LinkControl,

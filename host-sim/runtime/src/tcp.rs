@@ -16,7 +16,6 @@ use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use recipe_io::fairness::yield_fairly;
 use recipe_io::timer::now;
 
-/// The sending side of a connection.
 #[derive(Debug)]
 pub(super) struct Connection {
     write: OwnedWriteHalf,
@@ -43,7 +42,6 @@ pub(super) enum Accepted {
     All,
     /// Some wait; [`ConnectionEvent::Drained`] reports when they were sent.
     Later,
-    /// The connection has failed, or too many bytes wait.
     Failed,
 }
 
@@ -114,7 +112,6 @@ impl Connection {
         }
     }
 
-    /// Closes at once.
     pub(super) fn abort(&self) {
         self.end.set(ConnectionEnd::Abort);
         self.wake();
@@ -125,7 +122,6 @@ impl Connection {
         !self.out.borrow().is_empty()
     }
 
-    /// Whether it was closed by this side.
     pub(super) fn is_closed(&self) -> bool {
         self.end.get() != ConnectionEnd::Open
     }

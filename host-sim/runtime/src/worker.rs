@@ -22,7 +22,6 @@ pub(super) fn panicked() -> RunError {
     RunError::new("a thread panicked").after_start()
 }
 
-/// The runtime of a thread.
 pub(super) fn runtime() -> Result<tokio::runtime::Runtime, RunError> {
     tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(no_runtime)
 }
@@ -34,7 +33,6 @@ pub(super) fn no_runtime(error: io::Error) -> RunError {
 /// Where a runtime runs.
 #[derive(Debug, Clone)]
 pub(crate) struct RuntimePlace {
-    /// The span of its log lines.
     pub(crate) span: Span,
     shared: Option<(Arc<Worker>, Begin)>,
 }
@@ -113,7 +111,6 @@ impl Worker {
         Ok(Arc::new(Self { jobs: Some(jobs), thread: Some(thread) }))
     }
 
-    /// Runs a runtime on it.
     pub(super) fn run<F>(
         self: Arc<Self>,
         span: Span,
@@ -163,7 +160,6 @@ impl SharedRuntime {
         self.end.result().is_some()
     }
 
-    /// Waits for its end.
     pub(super) fn ended(self) -> Result<(), RunError> {
         let result = self.end.result();
         let mut result = self
@@ -175,7 +171,6 @@ impl SharedRuntime {
     }
 }
 
-/// The result of a runtime, once it has ended.
 #[derive(Debug, Default)]
 struct RuntimeEnd {
     result: Mutex<Option<Result<(), RunError>>>,

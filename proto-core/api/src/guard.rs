@@ -187,9 +187,6 @@ impl Guard {
     }
 
     /// Decides about a request.
-    ///
-    /// # Errors
-    /// Why it is refused.
     pub fn admit(
         &mut self,
         now: Instant,

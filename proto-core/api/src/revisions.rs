@@ -54,7 +54,6 @@ pub struct Revisions {
     is_due: bool,
 }
 
-/// What is being done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum RevisionPhase {
     /// The live one runs.
@@ -269,9 +268,6 @@ impl Revisions {
 
     /// Somebody stores a configuration that was made from `base`. Returns its number; it is kept once the
     /// store has succeeded.
-    ///
-    /// # Errors
-    /// Why it is not stored.
     pub fn put(&mut self, base: Revision, digest: u32) -> core::result::Result<u32, Refused> {
         self.must_rest()?;
         match self.base() {
@@ -290,9 +286,6 @@ impl Revisions {
     }
 
     /// Somebody applies a revision, or the one that waits. Returns its number.
-    ///
-    /// # Errors
-    /// Why it is not applied.
     pub fn apply(&mut self, number: Option<u32>, trial: Duration) -> core::result::Result<u32, Refused> {
         self.must_rest()?;
         if !TRIAL.contains(&trial) {
@@ -313,9 +306,6 @@ impl Revisions {
     }
 
     /// Somebody confirms what runs on trial. Returns its number; it is live once it is marked.
-    ///
-    /// # Errors
-    /// Why it is not confirmed.
     pub fn confirm(&mut self, now: Instant) -> core::result::Result<u32, Refused> {
         match self.phase {
             RevisionPhase::Trial { number, until } if now < until => {
@@ -329,9 +319,6 @@ impl Revisions {
 
     /// Somebody takes back what runs on trial, or else what is live. Returns the number of the one that runs
     /// next.
-    ///
-    /// # Errors
-    /// Why it is not taken back.
     pub fn roll_back(&mut self) -> core::result::Result<u32, Refused> {
         match (self.phase, self.previous) {
             (RevisionPhase::Trial { number, .. }, _) => {

@@ -259,9 +259,6 @@ pub enum RouteError {
 }
 
 /// The route of a request.
-///
-/// # Errors
-/// If there is none.
 pub fn find(head: &HttpHead<'_>, served: Served) -> Result<&'static Route, RouteError> {
     let path = head.path();
     let here = || ROUTES.iter().filter(move |route| route.path == path && route.served.contains(&served));

@@ -29,7 +29,6 @@ impl<const ROOM: usize> History<ROOM> {
         self.lost
     }
 
-    /// Number of values in it.
     pub(crate) fn len(&self) -> usize {
         self.kept.len()
     }

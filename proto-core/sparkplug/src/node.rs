@@ -117,7 +117,6 @@ struct Dates {
     is_utc: bool,
 }
 
-/// A birth on its way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Birth {
     owner: Owner,
@@ -506,7 +505,6 @@ impl NodeMetric {
     }
 }
 
-/// What a packet says.
 enum PacketContent {
     Accepted(u8),
     Subscribed(bool),

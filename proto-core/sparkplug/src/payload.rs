@@ -47,7 +47,6 @@ pub(crate) fn end(out: &mut ByteWriter<'_>, seq: u8) {
     protobuf::number(out, 3, seq.into());
 }
 
-/// The payload of NDEATH.
 pub(crate) fn death(out: &mut ByteWriter<'_>, timestamp: u64, bd_seq: u8) {
     begin(out, timestamp);
     metric(out, &bd_seq_metric(timestamp, bd_seq));

@@ -49,7 +49,6 @@ pub(crate) fn message(out: &mut ByteWriter<'_>, field: u8, write: impl Fn(&mut B
     write(out);
 }
 
-/// A value of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ProtobufField<'a> {
     Number(u64),

@@ -19,11 +19,9 @@ enum InjectedFault {
     Spin,
     Panic,
     Overflow,
-    /// Reads an address without memory.
     Fault,
 }
 
-/// Starts the requested fault.
 pub(super) fn start(tasks: &Tasks) {
     let asked = argument(2, |name| {
         Some(match name {

@@ -12,13 +12,11 @@ pub(crate) const WATCHDOG: u32 = 0x4000_8000;
 pub(crate) const FPGAIO: u32 = 0x4002_8000;
 pub(crate) const LAN9118: u32 = 0xA000_0000;
 
-/// Reads a device's register.
 pub(crate) fn read(address: u32) -> u32 {
     // SAFETY: callers pass registers of the devices above; reading them has no effect on memory.
     unsafe { core::ptr::with_exposed_provenance::<u32>(address as usize).read_volatile() }
 }
 
-/// Writes a device's register.
 pub(crate) fn write(address: u32, value: u32) {
     // SAFETY: callers pass registers of the devices above, none of which writes to memory.
     unsafe { core::ptr::with_exposed_provenance_mut::<u32>(address as usize).write_volatile(value) }

@@ -23,9 +23,7 @@ static RECORD: Record = Record {
 
 #[repr(C, align(8))]
 struct Record {
-    /// Length of the text in bytes.
     len: AtomicU32,
-    /// Hash of the text.
     sum: AtomicU32,
     text: [AtomicU8; MAX_TEXT],
     /// Written last: the RAM's controller holds an incomplete 64-bit word until the next write, and a reset would

@@ -80,7 +80,6 @@ fn millis() -> u32 {
     Instant::now().as_millis() as u32
 }
 
-/// Time of the last feed, in milliseconds.
 static FED: AtomicU32 = AtomicU32::new(0);
 /// A hang was saved, which a feed may still disprove.
 static IS_LATE: AtomicBool = AtomicBool::new(false);

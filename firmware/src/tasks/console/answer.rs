@@ -14,7 +14,6 @@ use recipe_api::revisions::Revision;
 
 use super::MAX_TIME;
 
-/// Why a reply could not be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum SendError {
     /// The client has closed or reset the connection.
@@ -51,7 +50,6 @@ impl Reply {
         Self { status, kind, etag: None, allow: None, retry_after_s: None, len }
     }
 
-    /// A JSON object with the key `error`.
     pub(super) fn error(buf: &mut [u8], status: StatusCode, text: impl Display) -> Self {
         Self::refusing(buf, status, &text)
     }
@@ -75,11 +73,9 @@ impl Reply {
     }
 }
 
-/// Result of executing a request.
 pub(super) enum RequestOutcome {
     /// A reply that remains to be sent.
     Reply(Reply),
-    /// The reply was sent.
     Sent,
 }
 
@@ -94,7 +90,6 @@ pub(super) struct Responder<'s, 'a> {
 }
 
 impl Responder<'_, '_> {
-    /// Sends bytes; fails at `until`.
     pub(super) async fn send(&mut self, mut bytes: &[u8], until: Instant) -> Result<(), SendError> {
         while !bytes.is_empty() {
             match with_deadline(until, self.socket.write(bytes)).await {
@@ -106,7 +101,6 @@ impl Responder<'_, '_> {
         Ok(())
     }
 
-    /// Sends part of the buffer.
     pub(super) async fn send_part(
         &mut self,
         from: usize,
@@ -124,7 +118,6 @@ impl Responder<'_, '_> {
         Ok(())
     }
 
-    /// Sends a reply with its body.
     pub(super) async fn answer(&mut self, reply: &Reply) -> Result<(), SendError> {
         let body = reply.len.ok_or(SendError::TooLong)?;
         // Behind the body in the buffer, because it contains the body's length.
@@ -187,7 +180,6 @@ impl Responder<'_, '_> {
         self.send(b"\r\n", until).await
     }
 
-    /// Ends a body of chunks.
     pub(super) async fn last_chunk(&mut self) -> Result<(), SendError> {
         self.send(LAST_CHUNK.as_bytes(), Instant::now() + MAX_TIME).await
     }

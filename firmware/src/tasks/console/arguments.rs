@@ -51,7 +51,6 @@ impl HeadArguments {
     }
 }
 
-/// Arguments parsed from a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Arguments {
     /// The operation takes no arguments.

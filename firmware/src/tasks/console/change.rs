@@ -174,7 +174,6 @@ impl Console {
     }
 }
 
-/// Whether the request allows an older firmware.
 fn downgrade(buf: &mut [u8], request: &ConsoleRequest<'_>) -> Result<Downgrade, Reply> {
     match request.head.yes {
         None => Ok(Downgrade::Refused),

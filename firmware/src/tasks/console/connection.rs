@@ -147,7 +147,6 @@ impl Console {
         }
     }
 
-    /// Decides about a request by its head.
     #[inline(never)]
     fn decide(
         &self,
@@ -260,7 +259,6 @@ struct Decided {
     peer: Ipv4Addr,
 }
 
-/// Result of receiving a body.
 enum BodyRead {
     Whole,
     /// Its hash differs from the signed one.

@@ -23,7 +23,6 @@ impl DocumentSource {
 }
 
 impl Console {
-    /// Sends a document as the body of a reply.
     pub(super) async fn document(
         &self,
         responder: &mut Responder<'_, '_>,

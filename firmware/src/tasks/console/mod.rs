@@ -51,7 +51,6 @@ pub struct Console {
     gateway: &'static Gateway,
     /// `None` if the board has no store.
     store: Option<&'static StoreHandle>,
-    /// Field ports of the board.
     ports: Ports,
     node: NodeView,
     name: String<NAME>,
@@ -76,7 +75,6 @@ pub struct NodeView {
     pub clock: &'static WallClock,
 }
 
-/// Counters of connections. They wrap.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
 struct ConnectionCounters {
     connections: u32,

@@ -175,7 +175,6 @@ impl Console {
     }
 }
 
-/// Sends the newest lines of the log.
 async fn log(
     responder: &mut Responder<'_, '_>,
     request: &ConsoleRequest<'_>,
@@ -226,7 +225,6 @@ async fn page(
     Ok(RequestOutcome::Sent)
 }
 
-/// Writes the document `revisions`.
 fn write_revisions(
     out: &mut TextBuffer<'_>,
     store: &StoreHandle,

@@ -114,7 +114,6 @@ pub const PART: usize = 512;
 /// Shared by the store task and its clients.
 pub struct StoreHandle {
     pub(super) revisions: RefCell<Option<Revisions>>,
-    /// The configuration that runs.
     pub(super) running: Cell<Option<u32>>,
     pub(super) failure: RefCell<String<MAX_FAILURE>>,
     /// The lock is taken; there is one change at a time.
@@ -245,9 +244,6 @@ impl StoreLock<'_> {
     }
 
     /// Validates some more of the first `len` bytes of the image buffer. Returns whether there is more to do.
-    ///
-    /// # Errors
-    /// The image is invalid.
     pub fn scan(&self, len: usize) -> Result<bool, ImageError> {
         self.look(len, |bytes| self.handle.scan.borrow_mut().step(bytes))
     }

@@ -4,7 +4,6 @@ use proto_core::time::{Duration, Instant};
 
 use super::Braking;
 
-/// The path time of a move.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PathClock {
     anchor: Instant,
@@ -17,7 +16,6 @@ pub(super) struct PathClock {
     slope: f64,
 }
 
-/// Path time and its derivatives at one instant.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PathTime {
     /// Seconds of path time.

@@ -172,7 +172,6 @@ impl RecipePort {
         self.cycle
     }
 
-    /// Sets the cycle, from the next output on.
     pub(super) fn set_cycle(&mut self, now: Instant, epoch: Instant, cycle: Duration) {
         self.cycle = cycle.max(MIN_CYCLE);
         if self.grid.is_some() {
@@ -182,7 +181,6 @@ impl RecipePort {
         }
     }
 
-    /// Everything given to the port has left.
     pub(super) fn sent(&mut self) {
         if self.transmitter == Transmitter::Sending {
             self.transmitter = Transmitter::Idle;

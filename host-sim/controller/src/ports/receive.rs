@@ -71,7 +71,6 @@ impl RecipePort {
         }
     }
 
-    /// A datagram arrived at the UDP server.
     pub(crate) fn client_sent(&mut self, now: Instant, peer: SocketAddr) {
         self.forget_silent(now);
         if let Medium::UdpServer(clients) = &mut self.medium
@@ -131,7 +130,6 @@ impl RecipePort {
         );
     }
 
-    /// The oldest frame that waits for a program.
     pub(crate) fn next_received(&mut self) -> Option<Received> {
         self.inbox.pop_front()
     }

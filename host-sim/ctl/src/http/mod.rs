@@ -61,11 +61,9 @@ impl HttpReply {
 pub(crate) enum NoReply {
     /// No connection was made; nothing was sent.
     Unreached(io::Error),
-    /// The connection was reset.
     Reset(String),
     /// It ended, or took too long, or is none.
     Broken(String),
-    /// The command shall end.
     Stopped,
 }
 
@@ -76,7 +74,6 @@ pub(crate) struct HttpExchange {
     /// The end of the time for the head, and for a body that is read as a whole.
     deadline: Instant,
     timeout: Duration,
-    /// Bytes behind the head.
     rest: Vec<u8>,
     head: HttpHead,
     stop: Stop,

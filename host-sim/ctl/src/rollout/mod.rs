@@ -28,9 +28,6 @@ pub trait RolloutBoard: Sync {
     /// It is not reached, or is no board that takes this firmware.
     fn inspect(&self) -> Result<BoardInfo, Failure>;
     /// How it does.
-    ///
-    /// # Errors
-    /// It is not reached.
     fn health(&self) -> Result<Health, Failure>;
     /// Sends the firmware, or what is missing of it. What runs stays.
     ///
@@ -43,9 +40,6 @@ pub trait RolloutBoard: Sync {
     /// It is refused, or the board does not come back with it.
     fn begin(&self) -> Result<(), Failure>;
     /// Confirms the firmware on trial.
-    ///
-    /// # Errors
-    /// It is refused, or the board not reached.
     fn confirm(&self) -> Result<(), Failure>;
     /// Takes back what is on trial: returns once the board runs the firmware before.
     ///
@@ -315,7 +309,6 @@ fn recover<B: RolloutBoard>(board: &B, plan: RolloutPlan, entry: &mut RolloutEnt
     }
 }
 
-/// A health on one line.
 fn words(health: &Health) -> String {
     let Health { word, links_up, ports_working } = health;
     format!("{word}, {links_up} links up, {ports_working} ports working")

@@ -162,7 +162,6 @@ fn put(
     client.call(&call)
 }
 
-/// The document of an answer.
 fn answered(client: &Client, reply: HttpReply) -> Result<Firmware, Failure> {
     Firmware::read(client, client.document(&client.accepted(reply)?)?)
 }
@@ -227,9 +226,6 @@ pub fn wait_confirmed(
 }
 
 /// Keeps the firmware that is on trial.
-///
-/// # Errors
-/// It is refused, or the board not reached.
 pub fn confirm(client: &Client) -> Result<Firmware, Failure> {
     post(client, "update/confirm", &json!({}))
 }
@@ -282,7 +278,6 @@ fn back(
     }
 }
 
-/// How a trial ended, in words.
 pub(super) fn ended_words(ended: &str) -> &str {
     match ended {
         "confirmed" => "it was confirmed",
@@ -308,5 +303,4 @@ const AWAY: Duration = Duration::from_secs(60);
 const REPLACING: Duration = Duration::from_secs(10);
 /// Time that a board may take to start again: three starts that the watchdog ends, and the one before.
 const RESTARTING: Duration = Duration::from_secs(60);
-/// Time between two looks.
 pub(super) const AGAIN: Duration = Duration::from_millis(300);

@@ -50,7 +50,6 @@ pub(super) fn counters(frame: CanErrorFrame) -> Option<(u8, u8)> {
     }
 }
 
-/// Whether the adapter lost received frames.
 pub(super) fn is_overflow(frame: CanErrorFrame) -> bool {
     let problems = frame.into_error().controller().unwrap_or(ControllerProblems::empty());
     problems.contains(ControllerProblems::RX_OVERFLOW)

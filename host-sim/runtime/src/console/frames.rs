@@ -88,7 +88,6 @@ impl FrameEvents {
     }
 }
 
-/// A capture for one client.
 pub(super) struct CaptureStream {
     subscription: Subscription,
     capture: Pcapng,

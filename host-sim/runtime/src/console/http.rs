@@ -135,7 +135,6 @@ impl ConsoleServer {
         self.answer(&mut stream, &reply, admitted.is_head).await
     }
 
-    /// Reads a body; `None` if it did not arrive.
     async fn body(
         &self,
         stream: &mut TcpStream,

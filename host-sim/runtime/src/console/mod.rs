@@ -179,9 +179,6 @@ impl Drop for Console {
 }
 
 /// Runs a gateway with a console, which can replace its configuration, until Ctrl-C, SIGTERM or SIGHUP.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn run_gateway(file: ConfigFile, console: &ConsoleOptions, options: &RunOptions) -> Result<(), RunError> {
     let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
@@ -189,7 +186,6 @@ pub fn run_gateway(file: ConfigFile, console: &ConsoleOptions, options: &RunOpti
     host::foreground(Box::new(supervised), options)
 }
 
-/// A simulated controller with a console.
 #[derive(Debug)]
 pub(crate) struct Consoled {
     ready: Value,
@@ -199,7 +195,6 @@ pub(crate) struct Consoled {
 }
 
 impl Consoled {
-    /// Serves a console for a controller that runs.
     pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, RunError> {
         let control = handle.place("control").parse();
         let control = control.map_err(|error| RunError::new(format!("control socket: {error}")))?;
@@ -234,7 +229,6 @@ impl ForegroundRun for Consoled {
     }
 }
 
-/// Everything that the connections share.
 struct ConsoleServer {
     address: SocketAddr,
     peer: Option<u16>,

@@ -12,7 +12,6 @@ use tokio::time::timeout;
 
 use super::reply::HttpReply;
 
-/// Executes the operation in a body.
 pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {
     let request = match serde_json::from_slice::<Map<String, Value>>(body) {
         Ok(request) => request,
@@ -50,7 +49,5 @@ async fn ask(control: SocketAddr, line: &str) -> io::Result<String> {
     }
 }
 
-/// How long an operation may take.
 const MAX_TIME: Duration = Duration::from_secs(30);
-/// Maximum length of an answer.
 const MAX_ANSWER: u64 = 4 << 20;

@@ -87,7 +87,6 @@ impl ConsoleServer {
         info
     }
 
-    /// The newest lines of the log.
     fn log(&self, head: &HttpHead<'_>) -> HttpReply {
         let count = match head.query("lines").map(str::parse) {
             None => MAX_NEWEST,
@@ -219,7 +218,6 @@ fn decoded(text: &str) -> Option<Cow<'_, str>> {
     String::from_utf8(bytes).ok().map(Cow::Owned)
 }
 
-/// The revisions, and what happens to them.
 pub(super) fn revisions(view: &SupervisorView) -> Value {
     let Some(revisions) = &view.revisions else { return json!({ "kept": [] }) };
     let kept: Vec<_> = view

@@ -7,7 +7,6 @@ use recipe_api::guard::Refusal;
 use recipe_api::response::{ContentType, Length, Page, Response, StatusCode};
 use serde_json::{Value, json};
 
-/// A response with its body.
 #[derive(Debug)]
 pub(super) struct HttpReply {
     pub(super) status: StatusCode,
@@ -48,7 +47,6 @@ impl HttpReply {
         Self { status: StatusCode::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
     }
 
-    /// The page for people, unless the client has it.
     pub(super) fn page(if_none_match: Option<&str>) -> Self {
         let status = PAGE.status(if_none_match);
         let body = ReplyBody::Bytes(if status == StatusCode::OK { PAGE.bytes } else { &[] });
@@ -100,7 +98,6 @@ pub(super) fn bytes_of(reply: &HttpReply) -> Vec<u8> {
     bytes
 }
 
-/// The text of a head.
 pub(super) fn head_of(reply: &HttpReply, length: Length) -> String {
     let fields: Vec<(&str, &dyn std::fmt::Display)> =
         reply.fields.iter().map(|(name, value)| (*name, value as &dyn std::fmt::Display)).collect();

@@ -108,7 +108,6 @@ impl Snapshots {
 }
 
 impl Snapshot {
-    /// The document `status`.
     pub(super) fn status(&self) -> Rc<str> {
         let make = || match &self.what {
             SnapshotContent::Controller(stats) => stats.to_string(),
@@ -117,7 +116,6 @@ impl Snapshot {
         Rc::clone(self.status.get_or_init(|| make().into()))
     }
 
-    /// The document `values`.
     pub(super) fn values(&self) -> Option<Rc<str>> {
         let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         let make = || {

@@ -19,7 +19,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::RunError;
 
-/// The revisions with their texts.
 #[derive(Debug)]
 pub(super) struct RevisionStore {
     folder: Option<StoreFolder>,
@@ -102,7 +101,6 @@ impl RevisionStore {
         written.map_err(|error| RunError::new(format!("--console-state: {error}")))
     }
 
-    /// The machine of these revisions.
     pub(super) fn revisions(&self) -> Option<Revisions> {
         let mut kept = heapless_revisions();
         for entry in &self.index.kept {
@@ -120,7 +118,6 @@ impl RevisionStore {
         self.texts.get(&number)
     }
 
-    /// Texts by revision number.
     pub(super) fn texts(&self) -> &BTreeMap<u32, Arc<str>> {
         &self.texts
     }
@@ -129,7 +126,6 @@ impl RevisionStore {
         Some(Revision { number, digest: digest(self.text(number)?) })
     }
 
-    /// Stores a text as a revision.
     pub(super) fn keep(
         &mut self,
         number: u32,

@@ -49,7 +49,6 @@ pub(super) async fn serve(
     }
 }
 
-/// The stream for a request.
 fn endless(
     server: &ConsoleServer,
     operation: ApiOperation,

@@ -28,7 +28,6 @@ use recipe_io::port::{BusSettings, OpenPort};
 use recipe_io::tcp_options;
 use recipe_io::timer::now;
 
-/// What ports are bound to.
 pub(super) struct Devices<'a> {
     pub(super) binds: &'a [Bind],
     /// Devices of the previous gateway, and where this one puts its own; `None` if it closes them.
@@ -215,7 +214,6 @@ async fn open_endpoint(to: To<'_>) -> Result<LinkEndpoint, RunError> {
 }
 
 impl LinkEndpoint {
-    /// The address of a listening link.
     fn place(&self) -> String {
         let address = match self {
             Self::TcpListen { listener, .. } => listener.local_addr(),

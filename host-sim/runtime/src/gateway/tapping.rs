@@ -34,7 +34,6 @@ pub(super) struct Tapping {
     ring: Producer<u8>,
     /// The message being built.
     message: Vec<u8>,
-    /// The message being built exceeds its maximum length.
     is_too_long: bool,
     /// Passes are recorded from the start of the engine on.
     records_passes: bool,

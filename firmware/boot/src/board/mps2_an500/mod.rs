@@ -52,7 +52,6 @@ pub(crate) unsafe fn stores() -> Option<(Area, Option<Area>)> {
     Some((store, None))
 }
 
-/// Writes a line to the log.
 pub(crate) fn say(line: fmt::Arguments<'_>) {
     console::print(format_args!("loader: {line}\r\n"));
 }
