@@ -10,7 +10,7 @@ use recipe_api::json;
 use recipe_api::key::SCHEME;
 use recipe_api::nonces::NonceText;
 use recipe_api::response::{ContentType, LAST_CHUNK, Length, Response, StatusCode};
-use recipe_api::revisions::Revision;
+use recipe_api::revisions::{Etag, Revision};
 
 use super::MAX_TIME;
 
@@ -223,26 +223,6 @@ impl Display for Challenge<'_> {
     }
 }
 
-pub(super) struct Etag(pub(super) Revision);
-
-impl Display for Etag {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "\"{}-{:08x}\"", self.0.number, self.0.digest)
-    }
-}
-
-impl Etag {
-    pub(super) fn parse(text: &str) -> Option<Revision> {
-        let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
-        let digest = u32::from_str_radix(digest, 16).ok()?;
-        let revision = Revision { number: number.parse().ok()?, digest };
-        // Only the canonical text is accepted.
-        let mut same = heapless::String::<24>::new();
-        write!(same, "{}", Self(revision)).ok()?;
-        (same == text).then_some(revision)
-    }
-}
-
 pub(super) fn busy(buf: &mut [u8]) -> Reply {
     Reply::error(buf, StatusCode::CONFLICT, "something else is being done; try again")
 }
@@ -253,27 +233,7 @@ pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
 
 #[cfg(test)]
 mod tests {
-    use std::string::ToString;
-
     use super::*;
-
-    #[test]
-    fn an_etag_has_one_text() {
-        let revision = Revision { number: 12, digest: 0xBAD_CAFE };
-        assert_eq!(Etag(revision).to_string(), "\"12-0badcafe\"");
-        assert_eq!(Etag::parse("\"12-0badcafe\""), Some(revision));
-        for wrong in [
-            "12-0badcafe",
-            "\"12-badcafe\"",
-            "\"12-0BADCAFE\"",
-            "\"+12-0badcafe\"",
-            "\"012-0badcafe\"",
-            "*",
-            "",
-        ] {
-            assert_eq!(Etag::parse(wrong), None, "{wrong}");
-        }
-    }
 
     #[test]
     fn what_has_no_room_is_noticed_and_nothing_is_written_behind_it() {

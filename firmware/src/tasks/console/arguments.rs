@@ -6,10 +6,8 @@ use recipe_api::arguments::{ArgumentValue, each};
 use recipe_api::key::{KEY_LEN, Key, from_hex};
 use recipe_api::request::{HttpHead, Method};
 use recipe_api::response::StatusCode;
-use recipe_api::revisions::Revision;
+use recipe_api::revisions::{Etag, Revision};
 use recipe_api::route::ApiOperation;
-
-use super::answer::Etag;
 
 /// What a head says beside the operation. It is parsed at once, so that the memory of the head is free for the reply.
 #[derive(Debug, Clone, Copy)]

@@ -26,13 +26,16 @@ impl Console {
     pub(super) async fn document(
         &self,
         responder: &mut Responder<'_, '_>,
-        kind: ContentType,
         mut source: DocumentSource,
     ) -> Result<RequestOutcome, SendError> {
         if self.is_idle() {
             let text = "nothing runs at the moment; try again";
             return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::UNAVAILABLE, text)));
         }
+        let kind = match source {
+            DocumentSource::Pieces(_) => ContentType::Json,
+            DocumentSource::Metrics(_) => ContentType::Metrics,
+        };
         if !responder.begin(kind, Length::Chunked, None).await? {
             return Ok(RequestOutcome::Sent);
         }

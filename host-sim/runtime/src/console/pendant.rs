@@ -28,7 +28,7 @@ pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {
         Ok(Ok(answer)) => {
             let is_done = serde_json::from_str::<Value>(&answer).is_ok_and(|answer| answer["ok"] == true);
             let status = if is_done { StatusCode::OK } else { StatusCode::UNPROCESSABLE };
-            HttpReply { status, kind: ContentType::Json, body: answer.trim_end().into(), fields: Vec::new() }
+            HttpReply::new(status, ContentType::Json, answer.trim_end())
         }
         Ok(Err(error)) => HttpReply::error(StatusCode::UNAVAILABLE, &format!("control socket: {error}")),
         Err(_) => HttpReply::error(

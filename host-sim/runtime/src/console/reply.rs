@@ -42,28 +42,27 @@ impl<T: Into<Rc<str>>> From<T> for ReplyBody {
 }
 
 impl HttpReply {
+    pub(super) fn new(status: StatusCode, kind: ContentType, body: impl Into<ReplyBody>) -> Self {
+        Self { status, kind, body: body.into(), fields: Vec::new() }
+    }
+
     /// A document that was made before.
     pub(super) fn text(kind: ContentType, body: Rc<str>) -> Self {
-        Self { status: StatusCode::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
+        Self::new(StatusCode::OK, kind, body)
     }
 
     pub(super) fn page(if_none_match: Option<&str>) -> Self {
         let status = PAGE.status(if_none_match);
-        let body = ReplyBody::Bytes(if status == StatusCode::OK { PAGE.bytes } else { &[] });
-        Self { status, kind: ContentType::Page, body, fields: Vec::new() }
+        let bytes = if status == StatusCode::OK { PAGE.bytes } else { &[] };
+        Self { body: ReplyBody::Bytes(bytes), ..Self::new(status, ContentType::Page, "") }
     }
 
     pub(super) fn image(bytes: Vec<u8>) -> Self {
-        Self {
-            status: StatusCode::OK,
-            kind: ContentType::Image,
-            body: ReplyBody::Made(bytes),
-            fields: Vec::new(),
-        }
+        Self { body: ReplyBody::Made(bytes), ..Self::new(StatusCode::OK, ContentType::Image, "") }
     }
 
     pub(super) fn json(status: StatusCode, value: &Value) -> Self {
-        Self { status, kind: ContentType::Json, body: value.to_string().into(), fields: Vec::new() }
+        Self::new(status, ContentType::Json, value.to_string())
     }
 
     /// An object with `error`.

@@ -102,7 +102,7 @@ impl RevisionStore {
     }
 
     pub(super) fn revisions(&self) -> Option<Revisions> {
-        let mut kept = heapless_revisions();
+        let mut kept = proto_core::heapless::Vec::new();
         for entry in &self.index.kept {
             kept.push(self.revision(entry.number)?).ok()?;
         }
@@ -239,10 +239,6 @@ fn lock(path: &Path) -> io::Result<File> {
     let lock = File::options().create(true).truncate(false).write(true).open(path.join("lock"))?;
     flock(&lock, FlockOperation::NonBlockingLockExclusive)?;
     Ok(lock)
-}
-
-fn heapless_revisions() -> proto_core::heapless::Vec<Revision, MAX_REVISIONS> {
-    proto_core::heapless::Vec::new()
 }
 
 fn name(number: u32) -> String {

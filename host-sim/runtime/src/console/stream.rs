@@ -84,7 +84,7 @@ async fn follow(server: &Rc<ConsoleServer>, stream: TcpStream, endless: Endless)
     };
     // Waiting events become old: about a second of them is enough.
     let _ = sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER);
-    let reply = HttpReply { status: StatusCode::OK, kind, body: "".into(), fields: Vec::new() };
+    let reply = HttpReply::new(StatusCode::OK, kind, "");
     let (mut read, mut write) = stream.into_split();
     let send = async {
         put(server, &mut write, head_of(&reply, Length::Endless).as_bytes()).await?;
