@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use proto_core::config::{GatewayConfig, MAX_PORTS, image};
 use proto_core::engine::Engine;
+use recipe_api::key::Hex;
 use recipe_config::board::Board;
 use recipe_config::file::{self, FileError};
 use serde_json::{Value, json};
@@ -179,8 +180,7 @@ pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure>
                     format!("an image of {} bytes that this program does not read: {why}\n", bytes.len())
                 }
             };
-            let hex: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
-            (json!({ "image": hex }), AnswerText::Made(text))
+            (json!({ "image": Hex(&bytes).to_string() }), AnswerText::Made(text))
         }
     };
     Ok(Answer { document, text, row: vec![("bytes", len)], verdict: Verdict::Well })
@@ -211,8 +211,7 @@ pub fn push(
         return Err(client.refused("it names no revision that a change could be based on"));
     };
     let call = Call { method: "PUT", path: "config", body, if_match: Some(etag), more_time: Duration::ZERO };
-    let reply = client.accepted(client.call(&call)?)?;
-    let document = client.document(&reply)?;
+    let document = client.ask(&call)?;
     let Some(revision) = document["waiting"].as_u64().or(document["revision"].as_u64()) else {
         return Err(client.refused("it does not say which revision it has stored"));
     };
@@ -269,9 +268,7 @@ pub fn apply(client: &Client, trial: TrialOptions) -> Result<Answer, Failure> {
 
 /// Makes a request that replaces the gateway.
 fn replacing(client: &Client, path: &str, arguments: &Value) -> Result<Value, Failure> {
-    let call = Call { more_time: REPLACING, ..Call::post(path, arguments) };
-    let reply = client.accepted(client.call(&call)?)?;
-    client.document(&reply)
+    client.ask(&Call { more_time: REPLACING, ..Call::post(path, arguments) })
 }
 
 /// The revisions once `found` is true of them; a failure if the trial of this one has `ended` before.
@@ -309,8 +306,7 @@ fn until(
 
 /// `confirm`.
 pub fn confirm(client: &Client) -> Result<Answer, Failure> {
-    let reply = client.accepted(client.call(&Call::post("confirm", &json!({})))?)?;
-    let document = client.document(&reply)?;
+    let document = client.ask(&Call::post("confirm", &json!({})))?;
     let live = document["live"].as_u64().unwrap_or_default();
     let row = vec![("revision", TableCell::number(live)), ("is", "live".into())];
     Ok(Answer::new(document, format!("revision {live} is live\n")).with_row(row))
@@ -373,9 +369,7 @@ fn no_trial(revisions: &Value) -> String {
 
 /// `identify`: a host writes a line, a board blinks its LED.
 pub fn identify(client: &Client, seconds: u32) -> Result<Answer, Failure> {
-    let arguments = json!({ "s": seconds });
-    let reply = client.accepted(client.call(&Call::post("identify", &arguments))?)?;
-    let document = client.document(&reply)?;
+    let document = client.ask(&Call::post("identify", &json!({ "s": seconds })))?;
     let text = format!("{} shows itself for {seconds} s\n", client.address());
     Ok(Answer::new(document, text))
 }

@@ -22,7 +22,7 @@ use crate::stop::Stop;
 const API: &str = "/api/v1/";
 
 /// A client of a gateway, for one thread at a time.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Client {
     address: Address,
     places: Vec<SocketAddr>,
@@ -80,13 +80,7 @@ impl<'a> Call<'a> {
     }
 
     pub(crate) const fn post(path: &'a str, body: &'a Value) -> Self {
-        Self {
-            method: "POST",
-            path,
-            body: RequestBody::Json(body),
-            if_match: None,
-            more_time: Duration::ZERO,
-        }
+        Self { method: "POST", body: RequestBody::Json(body), ..Self::get(path) }
     }
 }
 
@@ -108,9 +102,7 @@ impl Client {
     }
 
     pub(crate) fn until(&self, stop: Stop) -> Self {
-        let (address, places, key) = (self.address.clone(), self.places.clone(), self.key.clone());
-        let (host, timeout) = (self.host.clone(), self.timeout);
-        Self { address, places, host, key, timeout, stop, nonce: RefCell::new(None) }
+        Self { stop, nonce: RefCell::new(None), ..self.clone() }
     }
 
     pub(crate) fn with_key(&self, key: Key) -> Self {
@@ -132,8 +124,7 @@ impl Client {
     }
 
     pub(crate) fn json(&self, path: &str) -> Result<Value, Failure> {
-        let reply = self.get(path)?;
-        self.document(&reply)
+        self.ask(&Call::get(path))
     }
 
     /// A document that this server may not have: `None` if there is no such path.
@@ -157,6 +148,11 @@ impl Client {
             200..=299 => Ok(reply),
             _ => Err(self.refusal(&reply)),
         }
+    }
+
+    /// Makes a request, and returns the document of its answer.
+    pub(crate) fn ask(&self, call: &Call<'_>) -> Result<Value, Failure> {
+        self.document(&self.accepted(self.call(call)?)?)
     }
 
     pub(crate) fn document(&self, reply: &HttpReply) -> Result<Value, Failure> {

@@ -62,7 +62,7 @@ pub struct ControllerOptions {
 pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), RunError> {
     let run = options.run.clone();
     let bound = run.console.as_ref().map(ConsoleOptions::bind).transpose()?;
-    let handle = spawn(config, options)?;
+    let handle = start_with(config, options)?;
     match bound {
         Some(bound) => host::foreground(Box::new(Consoled::start(bound, handle, run.log.clone())?), &run),
         None => host::foreground(Box::new(handle), &run),
@@ -80,10 +80,6 @@ pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
 
 /// Same, with options. Those for a run in the foreground have no effect.
 pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunError> {
-    spawn(config, options)
-}
-
-fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunError> {
     host::start(&RuntimePlace::alone(), "controller", async move |_| {
         let scheduling = match options.pace {
             // It would look for input with priority over the clients that it waits for.

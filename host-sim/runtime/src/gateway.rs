@@ -483,7 +483,7 @@ pub(crate) fn spawn(
         false => (None, None),
     };
     let publisher_slot = observers.snapshot_watch.as_ref().map(|watch| watch.open(&config));
-    let handle = host::start(place, "gateway", async move |at_end| {
+    let mut handle = host::start(place, "gateway", async move |at_end| {
         let devices = Devices { binds: &binds, handover: Some((handover, at_end)) };
         let mut gateway = PreparedGateway::open(&config, devices, TxPolicy::All, &observers).await?;
         gateway.slot = observers.slot;
@@ -497,7 +497,8 @@ pub(crate) fn spawn(
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
     })?;
-    Ok(handle.with_watch(watch).with_findings(texts))
+    (handle.watch, handle.findings) = (watch, texts);
+    Ok(handle)
 }
 
 /// Interval at which safe values are checked for.

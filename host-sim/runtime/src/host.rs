@@ -40,8 +40,9 @@ pub(super) trait Runtime: 'static {
 pub struct Handle {
     ready: Value,
     requests: mpsc::UnboundedSender<RuntimeRequest>,
-    watch: Watch,
-    findings: Option<FindingTexts>,
+    pub(super) watch: Watch,
+    /// Added to the statistics.
+    pub(super) findings: Option<FindingTexts>,
     home: Option<Home>,
 }
 
@@ -215,20 +216,6 @@ impl Handle {
     /// Frames and calls of the gateway, for any number of subscribers; a controller has none.
     pub fn watch(&self) -> &Watch {
         &self.watch
-    }
-
-    pub(super) fn with_watch(self, watch: Watch) -> Self {
-        // No struct update syntax: `Handle` implements `Drop`.
-        let mut handle = self;
-        handle.watch = watch;
-        handle
-    }
-
-    /// Adds the findings to the statistics.
-    pub(super) fn with_findings(self, findings: Option<FindingTexts>) -> Self {
-        let mut handle = self;
-        handle.findings = findings;
-        handle
     }
 
     /// Whether the runtime has ended by itself.

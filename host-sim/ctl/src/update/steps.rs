@@ -101,7 +101,7 @@ pub fn push(
             None => client.call(&Call::get("update")),
         };
         let firmware = match asked {
-            Ok(reply) => answered(client, reply)?,
+            Ok(reply) => Firmware::read(client, client.document(&client.accepted(reply)?)?)?,
             Err(failure) => {
                 let since = *lost.get_or_insert_with(Instant::now);
                 if since.elapsed() > AWAY || client.stop().wait(AGAIN) {
@@ -156,14 +156,7 @@ fn put(
         return Err(client.refused("it asks for bytes that the firmware does not have"));
     };
     let path = format!("update?offset={offset}{}", more(downgrade, '&'));
-    let more_time = Duration::ZERO;
-    let call =
-        Call { method: "PUT", path: &path, body: RequestBody::Image(piece), if_match: None, more_time };
-    client.call(&call)
-}
-
-fn answered(client: &Client, reply: HttpReply) -> Result<Firmware, Failure> {
-    Firmware::read(client, client.document(&client.accepted(reply)?)?)
+    client.call(&Call { method: "PUT", body: RequestBody::Image(piece), ..Call::get(&path) })
 }
 
 /// Runs what was received on trial: returns when the board has restarted with it.
@@ -241,8 +234,7 @@ pub fn take_back(client: &Client, progress: &mut dyn FnMut(UpdateProgress)) -> R
 }
 
 fn post(client: &Client, path: &str, arguments: &Value) -> Result<Firmware, Failure> {
-    let call = Call { more_time: REPLACING, ..Call::post(path, arguments) };
-    answered(client, client.call(&call)?)
+    Firmware::read(client, client.ask(&Call { more_time: REPLACING, ..Call::post(path, arguments) })?)
 }
 
 /// The board, once it is `there` again.
