@@ -55,7 +55,6 @@ struct NodeState {
 /// Transmissions of a node since the last report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct SentFrames {
-    /// Frames.
     pub(crate) frames: u64,
     /// Their data bytes.
     pub(crate) bytes: u64,

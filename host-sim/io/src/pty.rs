@@ -84,7 +84,6 @@ impl Pty {
         Ok(Self { link, master, terminal: RefCell::new(Some(terminal)), unread: Cell::new(false) })
     }
 
-    /// The path of the link.
     pub(crate) fn link(&self) -> &Path {
         self.link.path()
     }

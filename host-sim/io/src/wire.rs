@@ -25,9 +25,7 @@ pub(crate) struct NodeId(u64);
 /// A frame that was transmitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Transmitted {
-    /// The sender.
     pub(crate) from: NodeId,
-    /// The frame.
     pub(crate) frame: CanFrame,
     /// The end of the transmission.
     pub(crate) at: Instant,
@@ -74,7 +72,6 @@ impl Wire {
         }
     }
 
-    /// Adds a node.
     pub(crate) fn join(&mut self) -> NodeId {
         let id = NodeId(self.joined);
         self.joined += 1;
