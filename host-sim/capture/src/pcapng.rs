@@ -18,8 +18,7 @@ use pcap_file::{DataLink, Endianness};
 use proto_core::engine::{Rejection, TapDirection, TapPlace, TapVerdict};
 use proto_core::wire::can::CanId;
 
-use crate::frame::Frame;
-use crate::record::{Cell, Record, What, rejection};
+use crate::record::{Cell, Frame, Record, What, rejection};
 use crate::watch::Arrived;
 
 /// The first bytes of every pcapng file.
@@ -51,10 +50,7 @@ impl std::fmt::Debug for Pcapng {
 }
 
 impl Pcapng {
-    /// A capture of this.
-    ///
-    /// # Panics
-    /// Never: nothing fails that is written to memory.
+    /// An empty capture.
     pub fn new(scope: Scope) -> Self {
         let section = SectionHeaderBlock {
             endianness: Endianness::Little,

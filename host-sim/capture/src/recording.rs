@@ -25,8 +25,7 @@ use proto_core::wire::can::CanId;
 use serde_json::{Value, json};
 use tracing::{info, warn};
 
-use crate::frame::Frame;
-use crate::record::{Cell, Record, What, rejection};
+use crate::record::{Cell, Frame, Record, What, rejection};
 use crate::watch::{Arrived, Interest, Next, Subscription, Watch};
 use part::RecordingPart;
 

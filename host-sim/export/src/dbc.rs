@@ -136,6 +136,7 @@ fn number(id: CanId) -> u32 {
     }
 }
 
+#[derive(Default)]
 struct DbcWriter {
     owner: &'static str,
     nodes: Names,
@@ -167,15 +168,7 @@ impl DbcWriter {
                 Owner::Gateway => "Gateway",
                 Owner::Controller => "Controller",
             },
-            nodes: Names::default(),
-            message_names: Names::default(),
-            messages: String::new(),
-            comments: String::new(),
-            attributes: String::new(),
-            value_names: String::new(),
-            value_types: String::new(),
-            multiplexed: String::new(),
-            notes: Vec::new(),
+            ..Self::default()
         }
     }
 

@@ -5,7 +5,6 @@
 //! changes while there is no session is kept and told later, marked as historical.
 
 mod io;
-mod maybe;
 mod messages;
 mod poll;
 mod settings;
@@ -21,7 +20,6 @@ use crate::payload::{self, Asked, HostState};
 use crate::topic;
 use crate::value::{DataType, Stamp, Stored, Value};
 pub use io::{Input, NodeCounters, NodeError, NodeOutput, SessionFailure};
-use maybe::Maybe;
 pub use messages::MAX_METRIC;
 pub use settings::{Credential, MAX_TEXT, Settings};
 
@@ -502,6 +500,24 @@ impl NodeMetric {
     /// Its value was told, of this instant.
     fn tell(&mut self, at: Instant) {
         (self.published, self.published_at, self.is_pending) = (self.current, Stamp::of(at), false);
+    }
+}
+
+/// An option that is all zeros when there is nothing, whatever could be in it: so a node that is not made yet takes no
+/// flash.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+enum Maybe<T> {
+    Nothing,
+    Just(T),
+}
+
+impl<T: Copy> Maybe<T> {
+    const fn get(self) -> Option<T> {
+        match self {
+            Self::Nothing => None,
+            Self::Just(value) => Some(value),
+        }
     }
 }
 

@@ -1,4 +1,6 @@
-//! Arguments of operations: those of the head, and those of the body.
+//! A request with the arguments of its operation: those of the head, and those of the body.
+
+use core::net::Ipv4Addr;
 
 use proto_core::engine::PortId;
 use proto_core::time::Duration as Span;
@@ -8,6 +10,18 @@ use recipe_api::request::{HttpHead, Method};
 use recipe_api::response::StatusCode;
 use recipe_api::revisions::{Etag, Revision};
 use recipe_api::route::ApiOperation;
+
+use crate::tasks::store::StoreLock;
+
+/// A request after its head was parsed and its client admitted.
+pub(super) struct ConsoleRequest<'a> {
+    pub(super) head: HeadArguments,
+    pub(super) operation: ApiOperation,
+    pub(super) arguments: Arguments,
+    /// Length of the body in the image buffer of the store handle, and the lock on it.
+    pub(super) image: Option<(usize, StoreLock<'a>)>,
+    pub(super) peer: Ipv4Addr,
+}
 
 /// What a head says beside the operation. It is parsed at once, so that the memory of the head is free for the reply.
 #[derive(Debug, Clone, Copy)]

@@ -13,8 +13,7 @@ use recipe_api::route::ApiOperation;
 use recipe_update::Downgrade;
 
 use super::answer::{Reply, busy, nothing_kept};
-use super::arguments::Arguments;
-use super::request::ConsoleRequest;
+use super::arguments::{Arguments, ConsoleRequest};
 use super::{Console, edge};
 use crate::clock::now;
 use crate::fmt::DisplayText;

@@ -15,7 +15,6 @@ mod edge;
 mod firmware;
 mod frames;
 mod read;
-mod request;
 mod stream;
 
 use core::cell::{Cell, RefCell};

@@ -17,8 +17,8 @@ use recipe_api::route::ApiOperation;
 use serde::Serialize;
 
 use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer, busy, nothing_kept};
+use super::arguments::ConsoleRequest;
 use super::documents::DocumentSource;
-use super::request::ConsoleRequest;
 use super::{Console, MAX_ANSWER, MAX_TIME};
 use crate::clock::now;
 use crate::journal;

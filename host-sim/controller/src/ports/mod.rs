@@ -8,7 +8,6 @@
 //! later. Every received frame is applied at once.
 
 mod clients;
-mod counters;
 mod receive;
 mod recipe;
 mod send;
@@ -20,9 +19,9 @@ use proto_core::recipe::model::Mode;
 use proto_core::schedule::Grid;
 use proto_core::time::{Duration, Instant};
 
+use crate::counters::RecipePortCounters;
 use clients::Clients;
 pub use clients::MAX_UDP_CLIENTS;
-pub use counters::RecipePortCounters;
 pub(crate) use receive::Listening;
 pub use receive::MAX_INBOX;
 use receive::Received;

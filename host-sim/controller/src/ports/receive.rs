@@ -11,7 +11,8 @@ use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
 use super::recipe::PartLayouts;
-use super::{Medium, RecipePort, RecipePortCounters, Transmitter};
+use super::{Medium, RecipePort, Transmitter};
+use crate::counters::RecipePortCounters;
 use crate::registers::Registers;
 
 /// A frame of a user recipe, for a program.
