@@ -12,7 +12,6 @@ use semihosting::fs::File;
 use semihosting::io::Write;
 use static_cell::ConstStaticCell;
 
-/// Longest recording.
 const CAPACITY: usize = 3 * 512 * 1024;
 
 #[cortex_m_rt::entry]

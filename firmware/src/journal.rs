@@ -25,7 +25,6 @@ pub const CAPACITY: usize = 4096;
 /// Maximum length of a line in bytes, with its end.
 pub const MAX_LINE: usize = 192;
 
-/// The lines.
 struct Ring {
     bytes: Deque<u8, CAPACITY>,
     /// Number of bytes that were dropped since the start; it wraps.
@@ -37,7 +36,7 @@ static RING: Mutex<RefCell<Ring>> = Mutex::new(RefCell::new(Ring { bytes: Deque:
 /// Appends a line. Takes a critical section; not for interrupts with tight deadlines.
 #[inline(never)]
 pub fn note(level: Level, message: fmt::Arguments<'_>) {
-    let mut line = LineBuffer(String::new());
+    let mut line = String::<{ MAX_LINE - 1 }>::new();
     let micros = embassy_time::Instant::now().as_micros();
     let (seconds, rest) = (micros / 1_000_000, micros % 1_000_000);
     let level = match level {
@@ -45,11 +44,10 @@ pub fn note(level: Level, message: fmt::Arguments<'_>) {
         Level::Warn => "WARN ",
         Level::Error => "ERROR",
     };
-    // Truncated to the capacity.
-    let _ = write!(line, "{seconds:5}.{rest:06} {level} {message}");
+    let _ = write!(Truncated(&mut line), "{seconds:5}.{rest:06} {level} {message}");
     critical_section::with(|cs| {
         let mut ring = RING.borrow_ref_mut(cs);
-        ring.push(line.0.as_bytes());
+        ring.push(line.as_bytes());
     });
 }
 
@@ -106,10 +104,10 @@ impl Ring {
     }
 }
 
-/// A line, truncated at its capacity.
-struct LineBuffer(String<{ MAX_LINE - 1 }>);
+/// Writes text and truncates it at the capacity.
+pub(crate) struct Truncated<'a, const N: usize>(pub(crate) &'a mut String<N>);
 
-impl Write for LineBuffer {
+impl<const N: usize> Write for Truncated<'_, N> {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         for letter in text.chars() {
             self.0.push(letter).map_err(|_| fmt::Error)?;
@@ -178,8 +176,8 @@ mod tests {
         let mut ring = ring();
         ring.push(b"two\r\nlines");
         assert_eq!(all::<64>(&ring, 0), "two  lines\n");
-        let mut long = LineBuffer(String::new());
-        assert!(write!(long, "{}", "x".repeat(500)).is_err());
-        assert_eq!(long.0.len(), MAX_LINE - 1);
+        let mut long = String::<{ MAX_LINE - 1 }>::new();
+        assert!(write!(Truncated(&mut long), "{}", "x".repeat(500)).is_err());
+        assert_eq!(long.len(), MAX_LINE - 1);
     }
 }

@@ -45,9 +45,6 @@ impl Display for NoDevice {
 
 impl Ports {
     /// Checks that there is a device for each of the configuration's ports.
-    ///
-    /// # Errors
-    /// The first port without a device.
     pub fn have<'c>(self, wanted: impl Iterator<Item = &'c Bus>) -> Result<(), NoDevice> {
         let (mut lines, mut buses) = (self.lines, self.buses);
         for (port, bus) in (0..).zip(wanted) {

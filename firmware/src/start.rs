@@ -148,7 +148,6 @@ fn make_edge(
     edge_setup
 }
 
-/// Starts the store task.
 #[inline(never)]
 fn start_store_task(
     tasks: &Tasks,
@@ -228,7 +227,6 @@ fn wire(len: usize, gateway: &Gateway, config: &GatewayConfig, wiring: &mut Wiri
     );
 }
 
-/// Starts the tasks of the field ports.
 #[inline(never)]
 fn run_ports(
     tasks: &Tasks,
@@ -445,7 +443,6 @@ async fn watch_button(pulse: &'static Pulse, console: &'static Console, button: 
     pulse.run(pin!(console.watch(pulse, button))).await
 }
 
-/// Publishes the state of the gateway to a broker.
 #[embassy_executor::task]
 async fn edge_node(
     pulse: &'static Pulse,
@@ -459,7 +456,6 @@ async fn edge_node(
     pulse.run(pin!(node.run(gateway, pulse, stack, store, view.edge, view.clock, buffers))).await
 }
 
-/// Queries a server for UTC.
 #[embassy_executor::task]
 async fn time_server(
     pulse: &'static Pulse,
@@ -472,7 +468,6 @@ async fn time_server(
     pulse.run(pin!(time::run(pulse, stack, (host, port), clock, seed))).await
 }
 
-/// Logs the board's address whenever it changes.
 #[embassy_executor::task]
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
     let log = async {

@@ -42,7 +42,6 @@ impl<F> StorePlaces<F> {
 #[derive(Debug)]
 pub struct StoredConfig<F> {
     store: Store,
-    /// Flash of the store.
     flash: F,
     /// Target of a move, if the store is in the wrong bank.
     to: Option<F>,
@@ -216,9 +215,6 @@ impl<F: StoreFlash> StoredConfig<F> {
 
     /// Stores a configuration in the place of `forget` or in a free one. If the store is full, the oldest unmarked ones
     /// are forgotten.
-    ///
-    /// # Errors
-    /// It cannot be written.
     pub async fn keep(
         &mut self,
         number: u32,
@@ -256,9 +252,6 @@ impl<F: StoreFlash> StoredConfig<F> {
     }
 
     /// Stores the access key of the API.
-    ///
-    /// # Errors
-    /// It cannot be written.
     pub async fn set_access_key(&mut self, key: &[u8; 16]) -> Result<(), KeepError> {
         Ok(self.store.set_access_key(key)?.execute(&mut self.flash).await?)
     }
@@ -285,9 +278,6 @@ impl<F: StoreFlash> StoredConfig<F> {
     }
 
     /// Stores the bdSeq of the edge node's session.
-    ///
-    /// # Errors
-    /// It cannot be written.
     pub async fn set_session(&mut self, bd_seq: u8) -> Result<(), KeepError> {
         Ok(self.store.set_birth_sequence(bd_seq)?.execute(&mut self.flash).await?)
     }

@@ -205,9 +205,6 @@ impl<S: SlotFlash> Updates<S> {
 
     /// Accepts a piece. At `offset` 0 it is the header; the header of the firmware that is being received, or is
     /// complete in its slot, changes nothing.
-    ///
-    /// # Errors
-    /// See [`UpdateError`].
     pub async fn take(
         &mut self,
         offset: u32,
@@ -332,9 +329,6 @@ impl<S: SlotFlash> Updates<S> {
     }
 
     /// The firmware that may be put on trial.
-    ///
-    /// # Errors
-    /// There is none, or it may not be installed.
     pub fn ready(
         &self,
         kept: Option<(u32, u32)>,
@@ -349,9 +343,6 @@ impl<S: SlotFlash> Updates<S> {
     }
 
     /// Checks a signature. Blocks all tasks for some million instructions.
-    ///
-    /// # Errors
-    /// It was not made with the loader's key.
     #[inline(never)]
     pub fn verify(&self, header: &Header) -> Result<(), UpdateError> {
         let slots = self.slots.as_ref().map_err(|why| UpdateError::Cannot(why))?;

@@ -22,6 +22,7 @@ mod update;
 mod words;
 mod zeros;
 
+use core::fmt::Write;
 use core::hint::black_box;
 
 /// Bytes of a peer; contents and length are unknown to the compiler.
@@ -33,6 +34,16 @@ fn bytes() -> &'static [u8] {
 /// A value unknown to the compiler.
 fn any<T>(value: T) -> T {
     black_box(value)
+}
+
+/// A writer that may fail at any time.
+struct FailingWriter;
+
+impl Write for FailingWriter {
+    fn write_str(&mut self, text: &str) -> core::fmt::Result {
+        black_box(text);
+        any(Ok(()))
+    }
 }
 
 /// A buffer of unknown length.

@@ -45,7 +45,6 @@ fn modbus_client() {
     client.reset();
 }
 
-/// A register bank that accepts every address.
 pub(crate) struct AnyBank;
 
 impl RegisterBank for AnyBank {

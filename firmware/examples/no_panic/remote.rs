@@ -21,19 +21,9 @@ use recipe_api::route::{self, BodyType, Served};
 use recipe_api::{json, revisions};
 use static_cell::ConstStaticCell;
 
-use crate::{any, bytes};
+use crate::{FailingWriter, any, bytes};
 
 type SmallEngine = proto_core::engine::Engine<2, 1, 32, 0, 4>;
-
-/// A writer that may fail at any time.
-struct FailingWriter;
-
-impl Write for FailingWriter {
-    fn write_str(&mut self, text: &str) -> core::fmt::Result {
-        black_box(text);
-        any(Ok(()))
-    }
-}
 
 pub(crate) fn all() {
     let mut memory = [0; MAX_HEAD];

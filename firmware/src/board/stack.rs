@@ -7,7 +7,6 @@ unsafe extern "C" {
     static _stack_guard: u32;
     /// The stack's lowest address, where the guard ends.
     static _stack_end: u32;
-    /// Its upper end.
     static _stack_start: u32;
 }
 

@@ -46,7 +46,6 @@ pub struct Mcan<R> {
     bitrate: u32,
     /// The state reported last.
     state: Cell<BusState>,
-    /// Frames were queued whose completion has not been reported.
     is_sending: Cell<bool>,
     lost: u32,
     /// Alternates which FIFO is read first.
@@ -168,7 +167,6 @@ impl<R: McanBlock> Mcan<R> {
         }
     }
 
-    /// The controller's present error state.
     fn bus_state(&self) -> BusState {
         // After a message RAM access failure the controller only listens. The recovery is the same as from
         // bus-off.
@@ -266,7 +264,6 @@ impl<R: McanBlock> Mcan<R> {
         true
     }
 
-    /// Whether the transmit FIFO contains frames.
     fn is_transmitting(&self) -> bool {
         self.regs.read(TXBRP) != 0
     }

@@ -11,7 +11,6 @@ use crate::clock::now;
 
 /// Replies and frames queued for the line.
 const MAX_WAITING: usize = 512;
-/// Bytes per read.
 const CHUNK: usize = 64;
 
 /// The adapter.
@@ -33,7 +32,6 @@ impl<D: Read + Write> SlcanPort<D> {
         Self { line, channel, bitrate, input: Vec::new(), output: Vec::new(), is_sending: false }
     }
 
-    /// The next complete frame in the received bytes.
     fn take_frame(&mut self) -> Option<CanFrame> {
         let mut rest = self.input.as_slice();
         let mut frame = None;

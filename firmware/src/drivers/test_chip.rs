@@ -24,12 +24,10 @@ impl<P: Peripheral> TestDevice<P> {
         Rc::new(Self { model: RefCell::new(model), now: Cell::new(0), clocks, functions })
     }
 
-    /// Virtual time.
     pub(crate) fn now(&self) -> Picos {
         self.now.get()
     }
 
-    /// Level of its interrupt line.
     pub(crate) fn interrupt_line(&self) -> bool {
         self.with(|model| model.interrupt_line())
     }
@@ -39,14 +37,12 @@ impl<P: Peripheral> TestDevice<P> {
         f(&mut self.model.borrow_mut())
     }
 
-    /// A read of a register by the driver.
     #[track_caller]
     pub(crate) fn read(&self, offset: u32) -> u32 {
         let read = self.access(|model, at| model.read(offset, at));
         read.unwrap_or_else(|refusal| panic!("{} is read: {refusal}", self.name(offset)))
     }
 
-    /// A write of a register by the driver.
     #[track_caller]
     pub(crate) fn write(&self, offset: u32, value: u32) {
         let written = self.access(|model, at| model.write(offset, value, at));
@@ -75,7 +71,6 @@ impl<P: Peripheral> TestDevice<P> {
         due.is_some()
     }
 
-    /// Advances time.
     #[track_caller]
     pub(crate) fn pass(&self, span: Picos) {
         let end = self.now() + span;

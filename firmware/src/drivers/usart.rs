@@ -143,7 +143,6 @@ impl<R: UsartBlock> UsartAccess<'_, R> {
         self.regs.write(register, self.regs.read(register) & !bits);
     }
 
-    /// Empties the receive FIFO.
     fn receive(&mut self) {
         // Cleared before the FIFO is emptied, so that a later idle line interrupts again.
         self.regs.write(ICR, IDLE);

@@ -6,7 +6,6 @@ use recipe_store::{BLANK, FlashWord, Geometry, Put, Trial, Word};
 
 use super::*;
 
-/// Flash without faults.
 #[derive(Debug, Clone)]
 struct PlainFlash {
     words: List<Word>,

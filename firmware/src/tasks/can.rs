@@ -40,14 +40,19 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, can: impl CanPo
 /// What the task waits for, besides frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum CanPhase {
-    /// Frames to send.
     Idle,
     /// Frames in the controller must be sent by then.
-    Sending { until: Instant },
+    Sending {
+        until: Instant,
+    },
     /// Bus-off: restart at that time.
-    Off { until: Instant },
+    Off {
+        until: Instant,
+    },
     /// The controller is recovering; on timeout, recovery is retried.
-    Recovering { until: Instant },
+    Recovering {
+        until: Instant,
+    },
 }
 
 struct CanTask<'a, C> {
@@ -61,7 +66,6 @@ struct CanTask<'a, C> {
     is_failing: bool,
     /// Wait after the next bus-off.
     backoff: Duration,
-    /// Time of the last recovery.
     recovered: Instant,
     /// Lost frames reported by the last log line, and its time.
     lost: u32,
@@ -124,7 +128,6 @@ impl<C: CanPort> CanTask<'_, C> {
         }
     }
 
-    /// Transmits the engine's frames.
     async fn send_waiting(&mut self) {
         let mut frames = 0_u32;
         while let Some(frame) = self.control.next_frame() {
@@ -222,7 +225,6 @@ impl<C: CanPort> CanTask<'_, C> {
     }
 }
 
-/// Converts a frame of the driver.
 fn to_core(frame: &impl Frame) -> Option<CanFrame> {
     let id = CanId::from(frame.id());
     if frame.is_remote_frame() {

@@ -87,7 +87,6 @@ impl PortControl {
         }
     }
 
-    /// Ignores earlier sleeps.
     pub(crate) fn clear_sleep(&self) {
         self.has_slept.set(false);
     }
@@ -115,7 +114,6 @@ impl PortControl {
         if may_send { self.take_bytes() } else { None }
     }
 
-    /// Waits until there is a frame to send.
     pub(crate) async fn frame_waits(&self) {
         while !matches!(&*self.outbox.borrow(), PortOutbox::Frames(frames) if !frames.is_empty()) {
             self.changed.notified().await;

@@ -175,9 +175,6 @@ pub struct Node {
 impl Node {
     /// Creates the node for the running configuration. `bd_seq` is that of the last session; `seed` differs at each
     /// start.
-    ///
-    /// # Errors
-    /// See [`EdgeError`].
     pub fn make(
         document: &'static NodeDocument,
         node: &'static mut NodeState,
@@ -314,7 +311,6 @@ impl NodeDriver<'_> {
         self.node.handle(now(), Input::Values { first, values }, self.catalog);
     }
 
-    /// Executes the outputs of the node until it sleeps.
     async fn drain(&mut self, socket: &mut TcpSocket<'_>, piece: &mut [u8]) -> NodeStep {
         loop {
             let is_written = match self.node.poll_output(now(), self.catalog, piece) {

@@ -78,9 +78,6 @@ impl Gateway {
     }
 
     /// Applies the configuration; ports and links are down.
-    ///
-    /// # Errors
-    /// The engine refuses it.
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
         // Not in `idle`, which must be all zeros (.bss).
         self.deadline.set(Instant::NEVER);

@@ -105,7 +105,6 @@ impl<L: Line> SerialTask<'_, L> {
         self.gateway.input(Input::PortBytes { port: self.port, bytes });
     }
 
-    /// Reports all data in the device to the engine.
     fn report_waiting(&mut self) {
         for _ in 0..FULL_CHUNKS {
             match poll_once(self.line.read(&mut self.chunk)) {

@@ -76,7 +76,6 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse) -> ! {
     }
 }
 
-/// A link's state in the log.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum LoggedState {
     Down,

@@ -240,7 +240,6 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         (written.map(|()| 0).map_err(Failed::Store), is_restart)
     }
 
-    /// The next output of the revisions.
     fn next_output(&self) -> RevisionOutput {
         let mut revisions = self.handle.revisions.borrow_mut();
         // Set while the store task runs.

@@ -17,7 +17,6 @@ impl TestClock {
     }
 }
 
-/// Advances time.
 pub(crate) fn advance(by: Duration) {
     MockDriver::get().advance(by);
 }

@@ -21,7 +21,6 @@ type BoxedTask<'a> = Pin<Box<dyn Future<Output = ()> + 'a>>;
 /// The order of the woken tasks, on which nothing may depend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum WakeOrder {
-    /// Embassy's order.
     LastFirst,
     FirstFirst,
 }

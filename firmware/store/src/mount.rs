@@ -190,7 +190,6 @@ impl Store {
     }
 }
 
-/// Whether data and end match the head.
 pub(crate) fn is_whole(flash: &impl Flash, FlashWord { sector, word }: FlashWord, head: &RecordHead) -> bool {
     let mut digest = digest();
     let end = word.saturating_add(head.extent()).saturating_sub(1);

@@ -21,7 +21,6 @@ pub struct Put<'s, 'd> {
     work: Work,
 }
 
-/// State of writing a record.
 #[derive(Debug)]
 pub(crate) struct Work {
     head: RecordHead,
@@ -33,7 +32,6 @@ pub(crate) struct Work {
     copies: [u16; KEYS],
     /// Remaining attempts to begin a sector.
     turns: u8,
-    /// Remaining rewrites.
     tries: u8,
     /// A sector that is blank is not erased again before it is begun.
     is_erased: bool,
@@ -95,7 +93,6 @@ impl core::error::Error for PutError {}
 
 #[derive(Debug, Clone, Copy)]
 enum PutPhase {
-    /// Find space.
     Place,
     Append,
     Erase {
@@ -118,7 +115,6 @@ enum PutPhase {
     End(Result<(), PutError>),
 }
 
-/// Progress of writing a record.
 #[derive(Debug, Clone, Copy)]
 enum WordWriter {
     Head,
@@ -136,7 +132,6 @@ enum WriteProgress {
     Worn,
 }
 
-/// Source of a record's data.
 pub(crate) enum RecordSource<'d, F> {
     Bytes(&'d [u8]),
     Flash(&'d F, FoundRecord),
@@ -153,10 +148,8 @@ impl<F: Flash> RecordSource<'_, F> {
     }
 }
 
-/// The sector that a record is written to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum PutTarget {
-    /// The current sector.
     Filled,
     /// The target of copying.
     Next,
@@ -409,12 +402,10 @@ impl Work {
     }
 }
 
-/// Whether all words of a sector look blank.
 pub(crate) fn is_blank(flash: &impl Flash, sector: u8) -> bool {
     (0..flash.geometry().words).all(|word| flash.read(FlashWord { sector, word }) == BLANK)
 }
 
-/// The head of a record.
 pub(crate) fn head_of(flash: &impl Flash, found: FoundRecord) -> Option<RecordHead> {
     let word = FlashWord { word: found.data.word.saturating_sub(1), ..found.data };
     RecordHead::parse(&flash.read(word))

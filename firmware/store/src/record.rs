@@ -11,7 +11,6 @@ use crate::{WORD, Word};
 pub const MAX_DATA: usize = 16 * 1024;
 /// Number of counters.
 pub const COUNTERS: u8 = 3;
-/// Number of keys.
 pub(crate) const KEYS: usize = 18;
 /// Version of the store's layout; others are not read.
 pub const VERSION: u32 = 1;
@@ -60,7 +59,6 @@ impl RecordKey {
     }
 }
 
-/// The head of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RecordHead {
     /// Code of the key.
@@ -109,7 +107,6 @@ impl RecordHead {
         ])
     }
 
-    /// Number of words of the record.
     pub(crate) fn extent(&self) -> u16 {
         extent(self.len as usize)
     }
@@ -120,7 +117,6 @@ pub(crate) fn extent(len: usize) -> u16 {
     u16::try_from(len.div_ceil(WORD)).map_or(u16::MAX, |data| data.saturating_add(2))
 }
 
-/// The head of a sector.
 pub(crate) enum SectorHead {
     /// A sector of this layout.
     Known {
@@ -128,10 +124,7 @@ pub(crate) enum SectorHead {
         sequence: u32,
     },
     /// A sector of another layout.
-    Other {
-        /// The version found.
-        version: u32,
-    },
+    Other { version: u32 },
 }
 
 impl SectorHead {
@@ -154,7 +147,6 @@ impl SectorHead {
     }
 }
 
-/// Builds a head word with its CRC.
 fn finished(parts: [[u8; 4]; 7]) -> Word {
     let mut word = [0; WORD];
     for (place, byte) in word.iter_mut().zip(parts.as_flattened()) {
@@ -186,7 +178,6 @@ pub(crate) fn part(data: &[u8], nth: u16) -> Word {
     word
 }
 
-/// CRC of the data as it is stored.
 pub(crate) fn sum(data: &[u8]) -> u32 {
     let mut digest = digest();
     for nth in 0..extent(data.len()).saturating_sub(2) {

@@ -182,5 +182,4 @@ impl Move<'_> {
     }
 }
 
-/// Maximum number of attempts to erase a sector.
 const ERASES: u8 = 2;

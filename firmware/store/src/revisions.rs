@@ -293,9 +293,6 @@ impl Store {
 
     /// Adopts an image from outside the store: stores it, makes it the live one, and records the adoption, so that it
     /// happens once. Call again after executing each [`Adoption::Write`]; it resumes after a power cut.
-    ///
-    /// # Errors
-    /// It cannot be written.
     pub fn adopt<'d>(&mut self, digest: u32, image: &'d [u8]) -> Result<Adoption<'_, 'd>, KeepError> {
         if self.is_adopted(digest, image.len()) {
             return Ok(Adoption::Done);

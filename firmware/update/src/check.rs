@@ -90,10 +90,6 @@ pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<H
     Ok(header)
 }
 
-/// Whether this header is for this slot and board.
-///
-/// # Errors
-/// Why not.
 pub(crate) fn fits(
     header: &Header,
     flash: &impl SlotFlash,
@@ -158,9 +154,6 @@ impl Check {
     }
 
     /// Checks everything that is left.
-    ///
-    /// # Errors
-    /// What is wrong with the image.
     pub(crate) fn whole(mut self, flash: &impl SlotFlash) -> Result<(), BadImage> {
         loop {
             if let Some(result) = self.step(flash, u16::MAX) {

@@ -120,9 +120,6 @@ pub fn link_padding(length: usize) -> usize {
 impl<'b> UpdateFile<'b> {
     /// Reads a file. Its form is checked, and that the links are of one firmware; not their contents
     /// ([`SlotImage::check`]) nor their signatures ([`Header::verify`]).
-    ///
-    /// # Errors
-    /// The bytes are malformed.
     pub fn parse(bytes: &'b [u8]) -> Result<Self, FileError> {
         let (head, mut rest) = bytes.split_first_chunk::<FILE_HEAD>().ok_or(FileError::NotAnUpdate)?;
         let &[magic, version, links, said] = head.as_chunks::<4>().0 else {
@@ -186,9 +183,6 @@ impl<'b> UpdateFile<'b> {
 
 impl SlotImage<'_> {
     /// Compares the image with CRC and hash of the header.
-    ///
-    /// # Errors
-    /// Which of them differs.
     pub fn check(&self) -> Result<(), BadImage> {
         if CRC.checksum(self.image) != self.header.crc() {
             return Err(BadImage::Crc);

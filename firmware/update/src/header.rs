@@ -254,9 +254,6 @@ impl Header {
     }
 
     /// Parses a header. Checks its form only, not the signature.
-    ///
-    /// # Errors
-    /// The bytes are malformed.
     pub fn parse(bytes: &[u8; HEADER]) -> Result<Self, HeaderError> {
         let mut fields = HeaderReader(bytes);
         let signature = fields.take();
@@ -323,9 +320,6 @@ impl Header {
     }
 
     /// Checks the signature. Blocks for some million instructions, so a board does it when no cell depends on it.
-    ///
-    /// # Errors
-    /// It was signed with another key, or not at all.
     pub fn verify(&self, key: &PublicKey) -> Result<(), Foreign> {
         key.0.verify(&self.signed(), &Signature::from(&self.signature)).map_err(|_| Foreign)
     }
@@ -360,7 +354,6 @@ impl Header {
     }
 }
 
-/// The rest of a header.
 struct HeaderReader<'b>(&'b [u8]);
 
 impl HeaderReader<'_> {

@@ -20,7 +20,6 @@ pub struct Receive {
     phase: ReceivePhase,
     /// Bytes of the image received so far.
     taken: u32,
-    /// The word being filled.
     word: Word,
     /// Number of bytes in `word`.
     collected: usize,

@@ -91,9 +91,6 @@ impl core::error::Error for UpdateRefused {}
 
 impl RunningFirmware {
     /// Checks that an update may be written to the free slot.
-    ///
-    /// # Errors
-    /// Why it may not be installed.
     pub fn accepts(
         &self,
         header: &Header,

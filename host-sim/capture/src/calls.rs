@@ -33,9 +33,6 @@ pub(crate) enum RecordingEnd {
 }
 
 /// Visits each call with its number.
-///
-/// # Errors
-/// That of `take`.
 pub(crate) fn each<E>(mut file: File, take: &mut Take<'_, E>) -> Result<RecordingEnd, E> {
     let Ok(len) = file.metadata().map(|found| found.len()) else { return Ok(RecordingEnd::Cut) };
     // The file of a killed process has no end. A damaged one may name a length that no memory has.

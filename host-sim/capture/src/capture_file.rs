@@ -170,8 +170,7 @@ mod tests {
     use proto_core::time::Instant;
 
     use super::*;
-    use crate::frame::Frame;
-    use crate::record::{Cell, CellPort, Epoch, Record, What};
+    use crate::record::{Cell, CellPort, Epoch, Frame, Record, What};
 
     fn deliver(watch: &Watch, frames: u64) {
         let port = CellPort { id: PortId(0), name: "line".into(), is_can: false, bit_rate: 0 };

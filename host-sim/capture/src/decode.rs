@@ -14,7 +14,7 @@ use recipe_export::names::mangle;
 use recipe_export::{BusModel, Format, Model, describe_use, unit_of};
 use serde_json::{Map, Value, json};
 
-use crate::frame::Frame;
+use crate::record::Frame;
 
 /// Knows the frames of a file; by default of one that has none.
 #[derive(Debug, Clone, Default)]
@@ -39,7 +39,6 @@ pub struct Topic {
     /// A JSON Schema of its values.
     pub schema: Value,
     format: Format,
-    /// The name of each element that has one.
     names: Vec<Option<String>>,
 }
 

@@ -9,7 +9,6 @@
 mod calls;
 mod capture_file;
 mod decode;
-mod frame;
 pub mod pcapng;
 mod record;
 pub mod recording;
@@ -20,6 +19,5 @@ mod watch;
 
 pub use capture_file::{CaptureFile, Target, replaceable};
 pub use decode::{Decoder, Topic};
-pub use frame::Frame;
-pub use record::{Cell, CellPort, Epoch, Record, What, rejection};
+pub use record::{Cell, CellPort, Epoch, Frame, Record, What, rejection};
 pub use watch::{Arrived, Interest, Next, Subscription, Watch};

@@ -9,8 +9,7 @@ use std::sync::Arc;
 use proto_core::engine::{Rejection, TapDirection, TapPlace, TapVerdict};
 use proto_core::wire::can::CanId;
 
-use crate::frame::Frame;
-use crate::record::{Cell, Record, What, rejection};
+use crate::record::{Cell, Frame, Record, What, rejection};
 use crate::watch::Arrived;
 
 /// The first bytes of every pcapng file.
@@ -37,7 +36,7 @@ pub struct Pcapng {
 }
 
 impl Pcapng {
-    /// A capture of this.
+    /// An empty capture.
     pub fn new(scope: Scope) -> Self {
         let mut new = Self { scope, bytes: Vec::new(), interfaces: Vec::new(), cell: None };
         let mut section = Block::new(u32::from_le_bytes(MAGIC));

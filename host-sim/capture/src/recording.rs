@@ -25,8 +25,7 @@ use proto_core::wire::can::CanId;
 use serde_json::{Value, json};
 use tracing::{info, warn};
 
-use crate::frame::Frame;
-use crate::record::{Cell, Record, What, rejection};
+use crate::record::{Cell, Frame, Record, What, rejection};
 use crate::watch::{Arrived, Interest, Next, Subscription, Watch};
 use part::RecordingPart;
 
@@ -59,9 +58,6 @@ pub struct Recording {
 
 impl Recording {
     /// Begins to record what `watch` tells; call it before the gateway starts, so that its run can be replayed.
-    ///
-    /// # Errors
-    /// If the folder cannot be made or read.
     pub fn start(watch: &Watch, options: RecordOptions) -> io::Result<Self> {
         let folder = Folder::open(&options.folder)?;
         let subscription = watch.subscribe(Interest { frames: true, passes: true }, ROOM);

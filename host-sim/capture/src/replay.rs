@@ -104,9 +104,6 @@ pub struct Difference {
 
 /// Replays a file, or the newest run of a folder. A file that is a part of a run stands for all of it. With
 /// `plain`, the recording is also written there without anything around it, as `proto_core::record::replay` takes it.
-///
-/// # Errors
-/// [`ReplayError`].
 pub fn replay(path: &Path, plain: Option<&mut dyn Write>) -> Result<Report, ReplayError> {
     let io_error = |error| ReplayError::Io(path.to_owned(), error);
     let mut runner = Runner { plain, ..Runner::default() };

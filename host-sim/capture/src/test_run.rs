@@ -12,8 +12,7 @@ use recipe_export::Model;
 use recipe_test_kit::example;
 
 use crate::decode::Decoder;
-use crate::frame::Frame;
-use crate::record::{Cell, Epoch, Record, What};
+use crate::record::{Cell, Epoch, Frame, Record, What};
 use crate::watch::Watch;
 
 /// The file whose gateway runs: frames of five bytes on a serial line.
@@ -27,7 +26,6 @@ pub(crate) struct TestRun {
 }
 
 impl TestRun {
-    /// The engine begins.
     pub(crate) fn begin(watch: &Watch) -> Self {
         Self::begin_with(watch, &std::fs::read_to_string(example(FILE)).unwrap())
     }
@@ -81,7 +79,6 @@ impl TestRun {
         self.watch.give(Record { at: self.at, lost, what: What::Pass(bytes.into()) });
     }
 
-    /// The engine ends.
     pub(crate) fn end(self) {
         let totals = totals(&*self.engine);
         self.entries(&[Entry::Totals(&totals)], 0);
@@ -100,7 +97,6 @@ fn encoded(entries: &[Entry<'_>]) -> Vec<u8> {
     bytes
 }
 
-/// What it runs.
 pub(crate) fn config() -> Box<GatewayConfig> {
     let text = std::fs::read_to_string(example(FILE)).unwrap();
     recipe_test_kit::toml::gateway(&text)

@@ -18,12 +18,10 @@ struct Instead {
     value: f32,
 }
 
-/// Where an item is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct SentItem {
     /// Its offset in the process image, and so in recipes' frames.
     image: Option<usize>,
-    /// Its offset in the state packet.
     packet: Option<usize>,
 }
 
@@ -59,7 +57,6 @@ impl Corrupted {
         Ok(())
     }
 
-    /// The items by name, and what is sent instead.
     pub(super) fn items(&self) -> impl Iterator<Item = (&str, f32)> {
         self.0.iter().map(|instead| (instead.name.as_str(), instead.value))
     }

@@ -213,7 +213,6 @@ impl std::fmt::Display for Happened {
     }
 }
 
-/// The recorded events.
 #[derive(Debug, Default)]
 pub(super) struct Recorder {
     on: bool,
@@ -230,7 +229,6 @@ pub(super) struct Recorder {
     now: Instant,
 }
 
-/// The states that were last reported.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct ReportedStates {
     robot: RobotState,
@@ -240,7 +238,6 @@ struct ReportedStates {
     speed: f32,
 }
 
-/// The values before a write.
 pub(super) struct Before {
     image: Box<[u8; IMAGE_BYTES]>,
     analog: ([u16; 8], [u16; 2]),

@@ -18,7 +18,6 @@ use super::{Controller, ControllerOutput, RecipeError};
 pub use recipe_config::CommandClients;
 use recipe_config::InitialTarget;
 
-/// The present faults.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Faults {
     muted: [bool; 3],
@@ -94,7 +93,6 @@ impl Faults {
         self.frozen = on.then_some(None);
     }
 
-    /// Replaces a packet by the frozen one.
     pub(super) fn freeze_packet(&mut self, packet: &mut Box<[u8; LEN]>) {
         if let Some(frozen) = &mut self.frozen {
             packet.clone_from(frozen.get_or_insert_with(|| packet.clone()));
@@ -105,7 +103,6 @@ impl Faults {
         self.transitions
     }
 
-    /// Ends all faults of a server.
     pub(super) fn heal_server(&mut self, link: Link) {
         let nth = link as usize;
         (self.muted[nth], self.refused[nth], self.garbage[nth]) = (false, false, false);
@@ -117,7 +114,6 @@ impl Faults {
         }
     }
 
-    /// Ends all faults but those of the configuration.
     pub(super) fn heal_all(&mut self) {
         let (command_clients, random) = (self.command_clients, self.random.clone());
         *self = Self { random, ..Self::new(command_clients) };

@@ -13,7 +13,6 @@ use super::Controller;
 use super::machine::{ErrorId, Machine};
 
 impl Controller {
-    /// Executes the functions of the inputs that have risen.
     pub(super) fn execute_functions(&mut self, now: Instant) {
         let Some(risen) = self.registers.take_risen() else { return };
         let inputs = &self.config.functions.inputs;
@@ -58,7 +57,6 @@ impl Controller {
         }
     }
 
-    /// Shows the present states in their outputs.
     pub(super) fn show_states(&mut self) {
         for output in &self.config.functions.outputs {
             self.registers.show_state(output.item, self.machine.is_in(output.state));

@@ -9,7 +9,6 @@ use super::Controller;
 /// Until when [`Controller::advance`] finds nothing. Every other change of the controller must call [`Self::ends`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Quiet {
-    /// Not included.
     until: Instant,
     /// The value of [`Controller::deadline`] until then.
     deadline: Instant,

@@ -1,6 +1,5 @@
 //! Random numbers that a seed decides: xorshift64*.
 
-/// A generator of random numbers.
 #[derive(Debug, Clone)]
 pub(super) struct Random(u64);
 

@@ -13,7 +13,6 @@ use super::program::{Call, CallReply, End, Program, Progress, Script, Variables,
 use super::registers::MachineCodes;
 use super::{ConnId, Controller, ControllerOutput, MAX_LOG};
 
-/// The program that has not ended.
 #[derive(Debug)]
 pub(super) struct RunningProgram {
     program: Program,
@@ -72,7 +71,6 @@ impl Controller {
         self.poll_server(now);
     }
 
-    /// When something is due without an input.
     pub(super) fn deadline(&self) -> Instant {
         let program = self.running.as_ref().filter(|_| self.machine.program_runs()).and_then(|running| {
             match running.activity {
@@ -98,7 +96,6 @@ impl Controller {
         Ok(transition)
     }
 
-    /// Executes the effect of a state change.
     pub(super) fn apply(&mut self, now: Instant, effect: Effect) {
         match effect {
             Effect::None => {}
@@ -359,7 +356,6 @@ impl Controller {
         if now >= until { Some(CallReply::Done) } else { self.begin_activity(Activity::Waiting { until }) }
     }
 
-    /// Starts the move of a call.
     fn start_move(&mut self, now: Instant, call: &Call) -> Result<(), String> {
         let rate = self.machine.rate();
         let (function, started) = match *call {

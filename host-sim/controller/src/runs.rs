@@ -61,7 +61,6 @@ impl std::fmt::Display for Run {
     }
 }
 
-/// The programs that were started.
 #[derive(Debug, Default)]
 pub(super) struct Runs {
     pub started: u64,

@@ -59,7 +59,6 @@ impl Controller {
         })
     }
 
-    /// The present faults, as `fault` takes them.
     fn faults(&self) -> Vec<Value> {
         let faults = &self.faults;
         let mut shown = Vec::new();

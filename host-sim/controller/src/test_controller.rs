@@ -65,11 +65,9 @@ pub struct TestController {
     /// Bytes that each client has received and [`Self::take`] has not returned.
     pub(crate) received: BTreeMap<ConnId, Vec<u8>>,
     pub(crate) closed: Vec<ConnId>,
-    /// Data sent by ports, with the time.
     pub(crate) sent: Vec<(Instant, usize, Out)>,
     /// Packets sent to all clients of port 2001, with the time.
     pub(crate) packets: Vec<(Instant, StatePacket)>,
-    /// Time that a port takes to send.
     pub(crate) line_time: Duration,
     /// Ports that are sending, with the time of their end.
     sending: Vec<(Instant, usize)>,
@@ -324,5 +322,4 @@ impl TestController {
     }
 }
 
-/// The clients' address.
 pub(crate) const CLIENT_ADDRESS: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);

@@ -22,7 +22,6 @@ pub struct Timeline {
     began: Option<Instant>,
 }
 
-/// A step of a timeline.
 #[derive(Debug, Clone)]
 struct TimelineStep {
     trigger: StepTrigger,

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 
 use recipe_test_kit::repository;
 
-/// Where the tests are.
 const TESTS: [&str; 6] = [
     "host-sim/controller",
     "host-sim/config",

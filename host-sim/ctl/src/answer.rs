@@ -15,7 +15,6 @@ pub struct Answer {
     pub(crate) verdict: Verdict,
 }
 
-/// Text for people.
 #[derive(Debug, Clone)]
 pub(crate) enum AnswerText {
     /// Made by this program.
@@ -25,7 +24,6 @@ pub(crate) enum AnswerText {
 }
 
 impl Answer {
-    /// An answer without trouble.
     pub(crate) fn new(document: Value, text: String) -> Self {
         Self { document, text: AnswerText::Made(text), row: Vec::new(), verdict: Verdict::Well }
     }

@@ -14,9 +14,6 @@ use crate::failure::Failure;
 use crate::reading::{log, metrics};
 
 /// The document. What a gateway does not tell is left out, and `missing` says why.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn bundle(client: &Client) -> Result<Value, Failure> {
     if let Some(document) = client.json_if_there("bundle")? {
         return Ok(document);
@@ -62,7 +59,6 @@ pub fn bundled(document: &Value, file: &str, len: usize) -> Answer {
     Answer::new(json!({ "file": file, "bytes": len }), text)
 }
 
-/// Asks for a part.
 type Get<'a> = &'a dyn Fn() -> Result<Value, Failure>;
 
 /// How long a board is listened to.

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use proto_core::config::{GatewayConfig, MAX_PORTS, image};
 use proto_core::engine::Engine;
+use recipe_api::key::Hex;
 use recipe_config::board::Board;
 use recipe_config::file::{self, FileError};
 use serde_json::{Value, json};
@@ -30,9 +31,6 @@ pub struct Configuration {
 impl Configuration {
     /// Reads a gateway file, with overrides that only a board takes, or an image, which only a board takes too. With a
     /// board, it must fit that one.
-    ///
-    /// # Errors
-    /// Its first mistake, with its place.
     pub fn read(path: &Path, set: &[String], board: Option<Board>) -> Result<Self, Failure> {
         let name = path.display().to_string();
         let whole = |why: String| FileError {
@@ -89,7 +87,6 @@ impl Configuration {
     }
 }
 
-/// Whether an address is a loopback address.
 fn is_this_machine(address: &str) -> bool {
     address == "localhost" || address.parse::<IpAddr>().is_ok_and(|ip| ip.to_canonical().is_loopback())
 }
@@ -106,9 +103,7 @@ fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
 /// What takes a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ServerRole {
-    /// A gateway on a host.
     Host,
-    /// A board.
     Board,
 }
 
@@ -136,9 +131,6 @@ pub enum Stored {
 }
 
 /// The configuration that runs, or another one that is kept.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn stored(client: &Client, revision: Option<u32>) -> Result<Stored, Failure> {
     let path = revision.map_or_else(|| "config".to_owned(), |number| format!("config?revision={number}"));
     let reply = client.get(&path)?;
@@ -159,9 +151,6 @@ impl Stored {
     }
 
     /// The configuration itself, as far as it says what runs: overrides of the command line are not in it.
-    ///
-    /// # Errors
-    /// If it is no configuration that this program reads.
     pub fn read(&self) -> Result<Box<GatewayConfig>, String> {
         match self {
             Self::Toml(toml) => {
@@ -174,9 +163,6 @@ impl Stored {
 }
 
 /// `config` without a file to write to.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure> {
     let stored = stored(client, revision)?;
     let len = TableCell::number(stored.bytes().len());
@@ -194,8 +180,7 @@ pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure>
                     format!("an image of {} bytes that this program does not read: {why}\n", bytes.len())
                 }
             };
-            let hex: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
-            (json!({ "image": hex }), AnswerText::Made(text))
+            (json!({ "image": Hex(&bytes).to_string() }), AnswerText::Made(text))
         }
     };
     Ok(Answer { document, text, row: vec![("bytes", len)], verdict: Verdict::Well })
@@ -211,9 +196,6 @@ pub struct TrialOptions {
 }
 
 /// `push`: stores a configuration, and puts it on trial if that is asked for.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn push(
     client: &Client,
     configuration: &Configuration,
@@ -229,8 +211,7 @@ pub fn push(
         return Err(client.refused("it names no revision that a change could be based on"));
     };
     let call = Call { method: "PUT", path: "config", body, if_match: Some(etag), more_time: Duration::ZERO };
-    let reply = client.accepted(client.call(&call)?)?;
-    let document = client.document(&reply)?;
+    let document = client.ask(&call)?;
     let Some(revision) = document["waiting"].as_u64().or(document["revision"].as_u64()) else {
         return Err(client.refused("it does not say which revision it has stored"));
     };
@@ -242,7 +223,6 @@ pub fn push(
     Ok(Answer::new(document, text).with_row(row))
 }
 
-/// An ETag as it may stand in a head.
 fn is_etag(text: &str) -> bool {
     text.len() <= 64 && text.bytes().all(|byte| byte.is_ascii_graphic())
 }
@@ -288,9 +268,7 @@ pub fn apply(client: &Client, trial: TrialOptions) -> Result<Answer, Failure> {
 
 /// Makes a request that replaces the gateway.
 fn replacing(client: &Client, path: &str, arguments: &Value) -> Result<Value, Failure> {
-    let call = Call { more_time: REPLACING, ..Call::post(path, arguments) };
-    let reply = client.accepted(client.call(&call)?)?;
-    client.document(&reply)
+    client.ask(&Call { more_time: REPLACING, ..Call::post(path, arguments) })
 }
 
 /// The revisions once `found` is true of them; a failure if the trial of this one has `ended` before.
@@ -327,12 +305,8 @@ fn until(
 }
 
 /// `confirm`.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn confirm(client: &Client) -> Result<Answer, Failure> {
-    let reply = client.accepted(client.call(&Call::post("confirm", &json!({})))?)?;
-    let document = client.document(&reply)?;
+    let document = client.ask(&Call::post("confirm", &json!({})))?;
     let live = document["live"].as_u64().unwrap_or_default();
     let row = vec![("revision", TableCell::number(live)), ("is", "live".into())];
     Ok(Answer::new(document, format!("revision {live} is live\n")).with_row(row))
@@ -349,9 +323,6 @@ pub enum WithoutTrial {
 
 /// `rollback`. The API steps back to the revision before if there is no trial, which is not what somebody wants who
 /// takes back a trial that has just ended by itself: so this looks first.
-///
-/// # Errors
-/// If it is refused, here or there, or not reached.
 pub fn rollback(client: &Client, without: WithoutTrial) -> Result<Answer, Failure> {
     if without == WithoutTrial::Refuse {
         let document = client.json("revisions")?;
@@ -397,13 +368,8 @@ fn no_trial(revisions: &Value) -> String {
 }
 
 /// `identify`: a host writes a line, a board blinks its LED.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn identify(client: &Client, seconds: u32) -> Result<Answer, Failure> {
-    let arguments = json!({ "s": seconds });
-    let reply = client.accepted(client.call(&Call::post("identify", &arguments))?)?;
-    let document = client.document(&reply)?;
+    let document = client.ask(&Call::post("identify", &json!({ "s": seconds })))?;
     let text = format!("{} shows itself for {seconds} s\n", client.address());
     Ok(Answer::new(document, text))
 }

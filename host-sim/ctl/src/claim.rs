@@ -46,8 +46,7 @@ pub fn claim(client: &Client, file: &Path, tell: &mut dyn FnMut(&str)) -> Result
     }
     let shown_name = info["name"].as_str().map(shown::line).unwrap_or_default().into_owned();
     wait(client, &info, &shown_name, tell)?;
-    let reply = client.call(&Call::post("claim", &json!({ "key": digits })))?;
-    client.accepted(reply)?;
+    client.accepted(client.call(&Call::post("claim", &json!({ "key": digits })))?)?;
     // The board stores the key before it replies; from then on all requests need it.
     owner.json("status")?;
     Ok(done(client, file, "it is claimed"))
@@ -96,5 +95,4 @@ fn wait(client: &Client, info: &Value, name: &str, tell: &mut dyn FnMut(&str)) -
 const WINDOW: Duration = Duration::from_secs(60);
 /// A key that is sent later than this before the end of the board's own minute might come too late.
 const MIN_LEFT_S: f64 = 1.0;
-/// Time between two looks.
 const AGAIN: Duration = Duration::from_millis(500);

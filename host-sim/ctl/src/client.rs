@@ -22,7 +22,7 @@ use crate::stop::Stop;
 const API: &str = "/api/v1/";
 
 /// A client of a gateway, for one thread at a time.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Client {
     address: Address,
     places: Vec<SocketAddr>,
@@ -34,7 +34,6 @@ pub struct Client {
     nonce: RefCell<Option<String>>,
 }
 
-/// The body of a request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum RequestBody<'a> {
     None,
@@ -81,13 +80,7 @@ impl<'a> Call<'a> {
     }
 
     pub(crate) const fn post(path: &'a str, body: &'a Value) -> Self {
-        Self {
-            method: "POST",
-            path,
-            body: RequestBody::Json(body),
-            if_match: None,
-            more_time: Duration::ZERO,
-        }
+        Self { method: "POST", body: RequestBody::Json(body), ..Self::get(path) }
     }
 }
 
@@ -108,14 +101,10 @@ impl Client {
         Self { host, ..self }
     }
 
-    /// The same gateway, until another end.
     pub(crate) fn until(&self, stop: Stop) -> Self {
-        let (address, places, key) = (self.address.clone(), self.places.clone(), self.key.clone());
-        let (host, timeout) = (self.host.clone(), self.timeout);
-        Self { address, places, host, key, timeout, stop, nonce: RefCell::new(None) }
+        Self { stop, nonce: RefCell::new(None), ..self.clone() }
     }
 
-    /// The same gateway with another key.
     pub(crate) fn with_key(&self, key: Key) -> Self {
         Self { key: Some(key), ..self.until(self.stop.clone()) }
     }
@@ -134,10 +123,8 @@ impl Client {
         Failure::Refused(format!("{}: {}", self.address, shown::line(&why.to_string())))
     }
 
-    /// A document.
     pub(crate) fn json(&self, path: &str) -> Result<Value, Failure> {
-        let reply = self.get(path)?;
-        self.document(&reply)
+        self.ask(&Call::get(path))
     }
 
     /// A document that this server may not have: `None` if there is no such path.
@@ -150,7 +137,6 @@ impl Client {
         }
     }
 
-    /// An answer to a plain read.
     pub(crate) fn get(&self, path: &str) -> Result<HttpReply, Failure> {
         let reply = self.call(&Call::get(path))?;
         self.accepted(reply)
@@ -164,18 +150,20 @@ impl Client {
         }
     }
 
-    /// A body as JSON.
+    /// Makes a request, and returns the document of its answer.
+    pub(crate) fn ask(&self, call: &Call<'_>) -> Result<Value, Failure> {
+        self.document(&self.accepted(self.call(call)?)?)
+    }
+
     pub(crate) fn document(&self, reply: &HttpReply) -> Result<Value, Failure> {
         serde_json::from_slice(&reply.body)
             .map_err(|_| self.refused("the answer is no JSON; is this a gateway?"))
     }
 
-    /// A body as text.
     pub(crate) fn text(&self, reply: HttpReply) -> Result<String, Failure> {
         String::from_utf8(reply.body).map_err(|_| self.refused("the answer is no text; is this a gateway?"))
     }
 
-    /// Opens a stream.
     pub(crate) fn stream(&self, path: &str) -> Result<EventStream<'_>, Failure> {
         self.opened(self.open(path)?)
     }
@@ -203,7 +191,6 @@ impl Client {
         self.opened(exchange).map(Some)
     }
 
-    /// Makes a request; any answer is one.
     pub(crate) fn call(&self, call: &Call<'_>) -> Result<HttpReply, Failure> {
         self.asked_again(call, || Ok(self.exchange(call)?.finish()?))
     }
@@ -390,7 +377,6 @@ const ATTEMPTS: u32 = 6;
 /// Between two of them.
 const AGAIN: Duration = Duration::from_millis(200);
 
-/// The events of a gateway.
 #[derive(Debug)]
 pub(crate) struct EventStream<'a> {
     client: &'a Client,

@@ -22,9 +22,6 @@ use crate::shown;
 use crate::table::{Look, TableCell, paint};
 
 /// `doctor`. Listens for `time` if the gateway does not say by itself what is wrong.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn doctor(client: &Client, time: StdDuration) -> Result<Answer, Failure> {
     let findings = match client.json_if_there("doctor")? {
         Some(document) => document["findings"].as_array().cloned().unwrap_or_default(),

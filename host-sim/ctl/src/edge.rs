@@ -36,14 +36,13 @@ pub fn set(client: &Client, settings: &[u8], from: From) -> Result<Answer, Failu
         From::Now => ("edge?restart=yes", RESTARTING),
     };
     let call = Call { method: "PUT", path, body: RequestBody::Image(settings), if_match: None, more_time };
-    let document = client.document(&client.accepted(client.call(&call)?)?)?;
+    let document = client.ask(&call)?;
     match from {
         From::NextStart => Ok(answer(document)),
         From::Now => restarted(client).map(answer),
     }
 }
 
-/// The document once the board has started again.
 fn restarted(client: &Client) -> Result<Value, Failure> {
     let deadline = Instant::now() + RESTARTING;
     loop {
@@ -74,11 +73,11 @@ fn answer(document: Value) -> Answer {
     let word = |key: &str| document[key].as_str().map(TableCell::of);
     let count = |key: &str| document["counters"][key].as_u64();
     let mut rows: Vec<(&'static str, TableCell)> = Vec::new();
-    rows.extend(word("state").map(|state| ("edge node", state)));
-    rows.extend(word("why").map(|why| ("why", why)));
-    rows.extend(word("broker").map(|broker| ("broker", broker)));
-    rows.extend(word("group").map(|group| ("group", group)));
-    rows.extend(word("node").map(|node| ("name", node)));
+    for (name, key) in
+        [("edge node", "state"), ("why", "why"), ("broker", "broker"), ("group", "group"), ("name", "node")]
+    {
+        rows.extend(word(key).map(|word| (name, word)));
+    }
     rows.extend(document["utc"].as_bool().map(|utc| ("UTC", if utc { "known" } else { "unknown" }.into())));
     rows.extend(word("time_server").map(|server| ("time server", server)));
     rows.extend(document["bd_seq"].as_u64().map(|number| ("session", TableCell::number(number))));
@@ -100,5 +99,4 @@ fn answer(document: Value) -> Answer {
 
 /// How long a board may take to start again.
 const RESTARTING: Duration = Duration::from_secs(30);
-/// Time between two looks.
 const AGAIN: Duration = Duration::from_millis(200);

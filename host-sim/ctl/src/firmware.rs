@@ -127,9 +127,6 @@ pub struct Update {
 
 impl Update {
     /// Reads a file.
-    ///
-    /// # Errors
-    /// It is no update file.
     pub fn read(path: &Path) -> Result<Self, Failure> {
         let bytes =
             std::fs::read(path).map_err(|error| Failure::wrong(format!("{}: {error}", path.display())))?;
@@ -138,9 +135,6 @@ impl Update {
     }
 
     /// Of the bytes that [`sign`] has made.
-    ///
-    /// # Errors
-    /// They are none.
     pub fn of(bytes: Vec<u8>) -> Result<Self, Failure> {
         UpdateFile::parse(&bytes).map_err(Failure::wrong)?;
         Ok(Self { bytes })
@@ -171,9 +165,6 @@ impl Update {
     }
 
     /// What it contains, and whether that is what was signed.
-    ///
-    /// # Errors
-    /// The public key cannot be read.
     pub fn inspect(&self, public: Option<&Path>, view: TableView) -> Result<Answer, Failure> {
         let key = public.map(signing_key::read_public).transpose()?;
         let links = self.links();
@@ -248,9 +239,6 @@ impl Update {
 }
 
 /// The public key that belongs to a private one.
-///
-/// # Errors
-/// The file is no private key.
 pub fn public_of(path: &Path) -> Result<PublicKey, Failure> {
     signing_key::read(path).map(|seed| PublicKey::of_seed(&seed.0))
 }

@@ -4,8 +4,8 @@
 //! [`MAX_AT_ONCE`] at a time; one that does not answer delays no other.
 
 use std::path::Path;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use recipe_api::key::Key;
@@ -112,7 +112,18 @@ pub fn ask(
         let is_over = stop.is_asked() || has_failed && rollout.is_some_and(|rollout| rollout.stop_on_failure);
         let found = match is_over {
             true => members.iter().map(|_| MemberOutcome::NotBegun).collect(),
-            false => ask_batch(members, timeout, stop, work),
+            false => side_by_side(
+                members,
+                stop,
+                |_| MemberOutcome::NotBegun,
+                |member| {
+                    let answer = member.client(timeout, stop.clone()).and_then(|client| work(&client));
+                    match answer {
+                        Ok(answer) => MemberOutcome::Answered(Box::new(answer)),
+                        Err(failure) => MemberOutcome::Failed(failure),
+                    }
+                },
+            ),
         };
         has_failed |= found.iter().any(|outcome| !matches!(outcome, MemberOutcome::Answered(_)));
         outcomes.extend(members.iter().map(|member| member.name.clone()).zip(found));
@@ -120,42 +131,34 @@ pub fn ask(
     Outcomes(outcomes)
 }
 
-fn ask_batch(
-    members: &[Member],
-    timeout: Duration,
+/// The result of `work` for each item, at most [`MAX_AT_ONCE`] at a time; that of `not_begun` for those that had not
+/// begun when the end was asked for.
+pub(crate) fn side_by_side<I: Sync, T: Send>(
+    items: &[I],
     stop: &Stop,
-    work: &(dyn Fn(&Client) -> Result<Answer, Failure> + Sync),
-) -> Vec<MemberOutcome> {
+    not_begun: impl Fn(&I) -> T,
+    work: impl Fn(&I) -> T + Sync,
+) -> Vec<T> {
     let next = AtomicUsize::new(0);
-    let found: Vec<Mutex<MemberOutcome>> =
-        members.iter().map(|_| Mutex::new(MemberOutcome::NotBegun)).collect();
+    let found: Vec<Mutex<T>> = items.iter().map(|item| Mutex::new(not_begun(item))).collect();
     std::thread::scope(|scope| {
-        for _ in 0..members.len().min(MAX_AT_ONCE) {
+        for _ in 0..items.len().min(MAX_AT_ONCE) {
             scope.spawn(|| {
                 while !stop.is_asked()
                     && let nth = next.fetch_add(1, Relaxed)
-                    && let (Some(member), Some(place)) = (members.get(nth), found.get(nth))
+                    && let (Some(item), Some(place)) = (items.get(nth), found.get(nth))
                 {
-                    let answer = member.client(timeout, stop.clone()).and_then(|client| work(&client));
-                    let outcome = match answer {
-                        Ok(answer) => MemberOutcome::Answered(Box::new(answer)),
-                        Err(failure) => MemberOutcome::Failed(failure),
-                    };
-                    *place.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = outcome;
+                    let result = work(item);
+                    *place.lock().unwrap_or_else(PoisonError::into_inner) = result;
                 }
             });
         }
     });
-    let taken =
-        |place: Mutex<MemberOutcome>| place.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
-    found.into_iter().map(taken).collect()
+    found.into_iter().map(|place| place.into_inner().unwrap_or_else(PoisonError::into_inner)).collect()
 }
 
 impl Outcomes {
     /// Whether all have answered, and whether all is well with them; a failure names those that have not.
-    ///
-    /// # Errors
-    /// If one has failed.
     pub fn verdict(&self) -> Result<Verdict, Failure> {
         let failed = self.0.iter().filter(|(_, outcome)| !matches!(outcome, MemberOutcome::Answered(_)));
         let names: Vec<_> = failed.map(|(name, _)| name.as_str()).collect();

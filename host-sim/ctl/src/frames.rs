@@ -15,7 +15,6 @@ use serde_json::{Map, Value};
 use crate::reading::number;
 use crate::shown;
 
-/// The data of an event.
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct FramesDocument {
     pub(crate) frames: Vec<FrameDocument>,
@@ -24,10 +23,8 @@ pub(crate) struct FramesDocument {
     pub(crate) lost: u64,
 }
 
-/// A frame.
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct FrameDocument {
-    /// On the gateway's clock.
     pub(crate) time_us: u64,
     /// The field port that it was at.
     pub(crate) port: String,
@@ -57,7 +54,6 @@ enum Direction {
 }
 
 impl FrameDocument {
-    /// Whether it came in.
     pub(crate) fn is_in(&self) -> bool {
         self.direction == Direction::In
     }
@@ -70,7 +66,6 @@ impl FrameDocument {
         rest.is_empty().then(|| pairs.iter().map(|[high, low]| high << 4 | low).collect())
     }
 
-    /// The id of a CAN frame.
     pub(crate) fn can_id(&self) -> Option<CanId> {
         let id = self.id?;
         match self.extended {

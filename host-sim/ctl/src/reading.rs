@@ -8,9 +8,6 @@ use crate::failure::{Failure, Verdict};
 use crate::table::{Look, TableCell, TableView, TextTable, facts};
 
 /// `info`.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn info(client: &Client) -> Result<Answer, Failure> {
     let document = client.json("info")?;
     let word = |key: &str| document[key].as_str().map(TableCell::of);
@@ -61,14 +58,10 @@ fn changes(info: &Value) -> TableCell {
 }
 
 /// `status`.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn status(client: &Client, view: TableView) -> Result<Answer, Failure> {
     Ok(status_of(client.json("status")?, view))
 }
 
-/// The status of this document.
 pub(crate) fn status_of(document: Value, view: TableView) -> Answer {
     let health = document["health"].as_str().unwrap_or_default();
     // A simulated controller has none.
@@ -207,14 +200,10 @@ fn latencies(document: &Value) -> TextTable {
 }
 
 /// `values`: the variables whose names contain one of the filters, capitals or not.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn values(client: &Client, filters: &[String], view: TableView) -> Result<Answer, Failure> {
     Ok(values_of(client.json("values")?, filters, view))
 }
 
-/// The variables of this document.
 pub(crate) fn values_of(mut document: Value, filters: &[String], view: TableView) -> Answer {
     let filters: Vec<_> = filters.iter().map(|filter| filter.to_lowercase()).collect();
     if let Some(values) = document.get_mut("values").and_then(Value::as_object_mut)
@@ -243,18 +232,12 @@ pub(crate) fn values_of(mut document: Value, filters: &[String], view: TableView
 }
 
 /// `metrics`.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn metrics(client: &Client) -> Result<Answer, Failure> {
     let text = client.text(client.get("metrics")?)?;
     Ok(text_answer("metrics", text))
 }
 
 /// `log`: the newest lines.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn log(client: &Client, lines: u32) -> Result<Answer, Failure> {
     let text = client.text(client.get(&format!("log?lines={lines}"))?)?;
     let lines: Vec<_> = text.lines().map(str::to_owned).collect();
@@ -276,14 +259,10 @@ fn text_answer(key: &str, text: String) -> Answer {
 }
 
 /// `revisions`.
-///
-/// # Errors
-/// If it is refused or not reached.
 pub fn revisions(client: &Client) -> Result<Answer, Failure> {
     Ok(revisions_of(client.json("revisions")?))
 }
 
-/// The revisions of this document.
 pub(crate) fn revisions_of(document: Value) -> Answer {
     let number = |key: &str| document[key].as_u64();
     let trial = document["trial"]["revision"].as_u64();
@@ -336,7 +315,6 @@ pub(crate) fn revisions_of(document: Value) -> Answer {
     Answer::new(document, text).with_row(row)
 }
 
-/// How a trial ended, in words.
 pub(crate) fn ended_words(name: &str) -> String {
     match name {
         "confirmed" => "confirmed".into(),
@@ -401,7 +379,6 @@ pub(crate) fn millis(ms: u64) -> String {
     }
 }
 
-/// Seconds in words.
 fn time(seconds: u64) -> String {
     match seconds {
         0..60 => format!("{seconds} s"),

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use recipe_api::key::Hex;
+use recipe_api::key::{Hex, from_hex};
 use recipe_io::random::random;
 use recipe_update::PublicKey;
 
@@ -17,9 +17,6 @@ pub(crate) struct Seed(pub(crate) [u8; 32]);
 
 /// Makes a key: the private one in a new file of mode 0600, the public one in another whose name ends in `.pub`.
 /// Returns the digits of the public one, and the name of its file.
-///
-/// # Errors
-/// One of the files exists, or cannot be written.
 pub fn make(path: &Path) -> Result<(String, PathBuf), Failure> {
     let public_path = beside(path);
     // Before anything is made: a private key without its public one would have to be deleted by hand.
@@ -33,35 +30,20 @@ pub fn make(path: &Path) -> Result<(String, PathBuf), Failure> {
     Ok((public, public_path))
 }
 
-/// Reads a private key.
 pub(crate) fn read(path: &Path) -> Result<Seed, Failure> {
-    parse(&digits::read(path)?).map(Seed).ok_or_else(|| {
+    from_hex(&digits::read(path)?).map(Seed).ok_or_else(|| {
         wrong(path, &"not 64 hexadecimal digits; `host-sim ctl keygen --signing FILE` makes a key")
     })
 }
 
-/// Reads a public key.
 pub(crate) fn read_public(path: &Path) -> Result<PublicKey, Failure> {
     let mut text = String::new();
     let file = File::open(path).and_then(|file| file.take(MAX_FILE).read_to_string(&mut text));
     file.map_err(|error| wrong(path, &error))?;
-    parse(&text)
+    from_hex(text.trim_end())
         .as_ref()
         .and_then(PublicKey::parse)
         .ok_or_else(|| wrong(path, &"not a public key: 64 hexadecimal digits of a file that ends in .pub"))
-}
-
-fn parse(text: &str) -> Option<[u8; 32]> {
-    let digits = text.trim_end().as_bytes();
-    let mut bytes = [0; 32];
-    if digits.len() != 2 * bytes.len() {
-        return None;
-    }
-    for (byte, pair) in bytes.iter_mut().zip(digits.as_chunks::<2>().0) {
-        let [high, low] = pair.map(|digit| char::from(digit).to_digit(16));
-        *byte = (high? << 4 | low?) as u8;
-    }
-    Some(bytes)
 }
 
 /// The name of the file with the public key.

@@ -17,7 +17,6 @@ pub struct TableView {
     pub is_terminal: bool,
 }
 
-/// How a cell looks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum Look {
     #[default]
@@ -27,7 +26,6 @@ pub(crate) enum Look {
     Warning,
 }
 
-/// A cell.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct TableCell {
     text: String,
@@ -67,7 +65,6 @@ impl From<String> for TableCell {
     }
 }
 
-/// Rows below a line of headings.
 #[derive(Debug, Clone)]
 pub(crate) struct TextTable {
     rows: Vec<Vec<TableCell>>,
@@ -82,7 +79,6 @@ impl TextTable {
         self.rows.push(cells.into_iter().collect());
     }
 
-    /// Whether there is nothing below the headings.
     pub(crate) fn is_empty(&self) -> bool {
         self.rows.len() <= 1
     }
@@ -140,7 +136,6 @@ pub(crate) fn facts(rows: impl IntoIterator<Item = (&'static str, TableCell)>) -
     text
 }
 
-/// A text with its colour.
 pub(crate) fn paint(text: &str, look: Look) -> String {
     let colour = match look {
         Look::Plain => return text.to_owned(),

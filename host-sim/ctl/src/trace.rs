@@ -19,18 +19,12 @@ pub struct Names(Decoder);
 
 impl Names {
     /// Those of this gateway file.
-    ///
-    /// # Errors
-    /// Its first mistake, with its place.
     pub fn read(path: &Path) -> Result<Self, Failure> {
         Ok(Self(Decoder::new(&Model::load(path, &[])?)))
     }
 }
 
 /// Prints frames of one port or of all until Ctrl-C. With `json` each frame as a document on a line.
-///
-/// # Errors
-/// If it is refused, not reached, or the stream ends.
 pub fn trace(
     client: &Client,
     port: Option<&str>,
@@ -105,7 +99,6 @@ pub(crate) fn is_plain(name: &str) -> bool {
     name.chars().all(|c| c.is_ascii_alphanumeric() || "-._~".contains(c))
 }
 
-/// Refuses a port that the gateway does not have.
 pub(crate) fn has_port(client: &Client, port: &str) -> Result<(), Failure> {
     let status = client.json("status")?;
     let ports = status["ports"].as_object();

@@ -21,9 +21,6 @@ pub enum Watched {
 
 /// Prints what the stream brings: on a terminal in place of what was there, elsewhere one after the other. With
 /// `json` one document a line.
-///
-/// # Errors
-/// If it is refused, not reached, or the stream ends.
 pub fn watch(
     client: &Client,
     what: &Watched,
@@ -66,9 +63,6 @@ fn print(answer: &Answer, json: bool, view: TableView, out: &mut dyn Write) -> R
 }
 
 /// Empties a terminal before something is watched on it.
-///
-/// # Errors
-/// If nothing more can be printed.
 pub fn clear(view: TableView, out: &mut dyn Write) -> Result<(), Failure> {
     if view.is_terminal {
         write!(out, "\x1b[2J")?;

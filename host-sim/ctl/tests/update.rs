@@ -136,7 +136,6 @@ fn serve(mut stream: TcpStream, board: &Mutex<Board>) -> Option<()> {
     .ok()
 }
 
-/// A board, and a client of it.
 fn board(state: Board) -> (Arc<Mutex<Board>>, Client) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string().parse().unwrap();

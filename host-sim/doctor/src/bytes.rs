@@ -32,7 +32,6 @@ pub(crate) fn places(bytes: &[u8], what: &[u8]) -> Vec<usize> {
     bytes.windows(what.len()).enumerate().filter(|(_, here)| *here == what).map(|(at, _)| at).collect()
 }
 
-/// Whether `what` is at `at`.
 pub(crate) fn is_at(bytes: &[u8], at: usize, what: &[u8]) -> bool {
     bytes.get(at..).is_some_and(|rest| rest.starts_with(what))
 }
@@ -56,7 +55,6 @@ pub(crate) fn list(bytes: &[u8]) -> String {
     format!("[{}]", items.join(", "))
 }
 
-/// `1 byte`, `2 bytes`.
 pub(crate) fn count(number: usize, one: &str) -> String {
     format!("{number} {one}{}", if number == 1 { "" } else { "s" })
 }

@@ -31,26 +31,20 @@ pub(crate) fn examine(seen: &PortCase<'_>, state: BusState, findings: &mut Vec<F
     if counters.rejected_length > 0 {
         findings.extend(length(seen, &recipe_ids));
     } else if counters.rejected_remote > 0 {
-        findings.push(seen.found(
-            Severity::Fault,
+        findings.push(seen.fault(
             Cause::Remote,
-            [
-                format!("{} remote frames", counters.rejected_remote),
-                "frames with data".into(),
-                "Another node asks for the data, and the device does not send it".into(),
-                "Let the device send by itself".into(),
-            ],
+            format!("{} remote frames", counters.rejected_remote),
+            "frames with data",
+            "Another node asks for the data, and the device does not send it",
+            "Let the device send by itself",
         ));
     } else if let Some((one, meant)) = other_kind(&foreign, &recipe_ids) {
-        findings.push(seen.found(
-            Severity::Fault,
+        findings.push(seen.fault(
             Cause::IdKind,
-            [
-                format!("id {} seen {} times", one.id, one.count()),
-                format!("id {meant}"),
-                "The number is right; one is an id of 11 bits and the other of 29".into(),
-                "Write `extended` of the frame in the recipe as the device has it".into(),
-            ],
+            format!("id {} seen {} times", one.id, one.count()),
+            format!("id {meant}"),
+            "The number is right; one is an id of 11 bits and the other of 29",
+            "Write `extended` of the frame in the recipe as the device has it",
         ));
     } else if !foreign.is_empty() {
         findings.push(ids(seen, foreign, &recipe_ids));
@@ -61,14 +55,14 @@ pub(crate) fn examine(seen: &PortCase<'_>, state: BusState, findings: &mut Vec<F
 
 fn bus(seen: &PortCase<'_>, cause: Cause, what: &str) -> Finding {
     let bitrate = bitrate(seen);
-    seen.found(Severity::Fault, cause, [
-        what.into(),
-        "error-active".into(),
+    seen.fault(
+        cause,
+        what,
+        "error-active",
         "Nobody acknowledges, or the nodes have different bit rates: a wire is open or swapped, a terminator \
-         is missing, or no other node is on"
-            .into(),
+         is missing, or no other node is on",
         format!("Check CAN-H and CAN-L, 120 ohm at both ends, and that all nodes have {bitrate} bit/s"),
-    ])
+    )
 }
 
 fn bitrate(seen: &PortCase<'_>) -> u32 {
@@ -89,15 +83,12 @@ fn ids(seen: &PortCase<'_>, mut foreign: Vec<&SeenId>, recipe_ids: &[CanId]) -> 
     foreign.sort_by_key(|one| std::cmp::Reverse(one.count()));
     let shown: Vec<_> =
         foreign.iter().take(4).map(|one| format!("id {} seen {} times", one.id, one.count())).collect();
-    seen.found(
-        Severity::Fault,
+    seen.fault(
         Cause::ForeignIds,
-        [
-            shown.join(", "),
-            format!("id {}", words(recipe_ids)),
-            "The device has another number, or the ids of the recipe are another device's".into(),
-            "Set the device's number, or write the id that is seen in the recipe".into(),
-        ],
+        shown.join(", "),
+        format!("id {}", words(recipe_ids)),
+        "The device has another number, or the ids of the recipe are another device's",
+        "Set the device's number, or write the id that is seen in the recipe",
     )
 }
 
@@ -113,7 +104,6 @@ fn other_kind<'a>(foreign: &[&'a SeenId], recipe_ids: &[CanId]) -> Option<(&'a S
     })
 }
 
-/// Frames of the right id and another length.
 fn length(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
     let one = seen.record.ids().iter().find(|one| recipe_ids.contains(&one.id))?;
     let Parts::Can { input, .. } = &seen.recipe.parts else { return None };
@@ -125,15 +115,12 @@ fn length(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
         _ => None,
     });
     let expected = sizes.sum::<Option<usize>>();
-    Some(seen.found(
-        Severity::Fault,
+    Some(seen.fault(
         Cause::CanLength,
-        [
-            format!("id {} with {} bytes", one.id, one.len),
-            expected.map_or("the length of the recipe".into(), |len| format!("{len} bytes")),
-            "The fields of the recipe are not those of the device".into(),
-            "Correct the fields of this id in the recipe".into(),
-        ],
+        format!("id {} with {} bytes", one.id, one.len),
+        expected.map_or("the length of the recipe".into(), |len| format!("{len} bytes")),
+        "The fields of the recipe are not those of the device",
+        "Correct the fields of this id in the recipe",
     ))
 }
 
@@ -141,25 +128,24 @@ fn nothing(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Finding {
     let severity = if seen.status.age.is_some() { Severity::Fault } else { Severity::Warning };
     let seconds = seen.status.age.unwrap_or(seen.case.running).as_millis() / 1000;
     if seen.record.fd_frames > 0 {
-        return seen.found(
-            Severity::Fault,
+        return seen.fault(
             Cause::CanLength,
-            [
-                format!("{} CAN FD frames", seen.record.fd_frames),
-                "classic CAN frames".into(),
-                "The device sends CAN FD".into(),
-                "Set the device to classic CAN".into(),
-            ],
+            format!("{} CAN FD frames", seen.record.fd_frames),
+            "classic CAN frames",
+            "The device sends CAN FD",
+            "Set the device to classic CAN",
         );
     }
-    seen.found(severity, Cause::NoBytes, [
+    seen.found(
+        severity,
+        Cause::NoBytes,
         format!("0 frames in {seconds} s"),
         format!("id {}", words(recipe_ids)),
-        "The device is off or not started, has another bit rate, or a wire is open".into(),
+        "The device is off or not started, has another bit rate, or a wire is open",
         format!(
             "Check the power, CAN-H and CAN-L, and the bit rate ({} bit/s); some devices need a start message, \
              such as CANopen's",
             bitrate(seen)
         ),
-    ])
+    )
 }

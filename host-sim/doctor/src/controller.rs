@@ -44,26 +44,19 @@ pub fn has_commands(config: ConfigView<'_>) -> bool {
 fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
     let place = FindingPlace::Port(port.name.clone());
     let given = port.command.clone().unwrap_or_else(|| "a command".to_owned());
-    let found = |severity, cause, [seen, expected, likely, remedy]: [String; 4]| {
-        Some(finding((severity, &place, cause), seen, expected, likely, remedy))
-    };
     match port.reply {
         ReplyCode::Fail => failed(case, port, &place),
         ReplyCode::Pending | ReplyCode::Other => {
             let others = case.status.links.iter().filter_map(|link| link.other_text.as_ref());
             let mut others = others.filter(|other| other.age < REPORTED_FOR);
             let other = others.find(|other| other.command == port.command && other.command.is_some())?;
-            found(
-                Severity::Fault,
-                Cause::OtherReply,
-                [
-                    format!("{given} answered{}: {:?}", ago(other.age), other.text),
-                    "success, fail or already, and the command's name".into(),
-                    "A controller version with other words: nobody knows whether it was done".into(),
-                    "Look at the robot: it is not sent again. Report the words, so that they can be read"
-                        .into(),
-                ],
-            )
+            Some(finding(
+                (Severity::Fault, &place, Cause::OtherReply),
+                format!("{given} answered{}: {:?}", ago(other.age), other.text),
+                "success, fail or already, and the command's name",
+                "A controller version with other words: nobody knows whether it was done",
+                "Look at the robot: it is not sent again. Report the words, so that they can be read",
+            ))
         }
         ReplyCode::NoReply => {
             let record = case.ports.iter().find(|record| record.port == port.id);
@@ -73,16 +66,13 @@ fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
                 return None;
             }
             let when = age.map_or_else(String::new, |age| format!(", given{}", ago(age)));
-            found(
-                Severity::Fault,
-                Cause::NoReply,
-                [
-                    format!("no reply to {given}{when}"),
-                    "a reply from the command port".into(),
-                    "The connection was lost, or the controller is busy or hangs".into(),
-                    "Look at the controller's own log; the command may have been carried out".into(),
-                ],
-            )
+            Some(finding(
+                (Severity::Fault, &place, Cause::NoReply),
+                format!("no reply to {given}{when}"),
+                "a reply from the command port",
+                "The connection was lost, or the controller is busy or hangs",
+                "Look at the controller's own log; the command may have been carried out",
+            ))
         }
         ReplyCode::NotSent => {
             let (why, age) = match &port.not_given {
@@ -90,17 +80,13 @@ fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
                 Some(last) => (last.text.as_str(), ago(last.age)),
                 None => ("the link or its room was lacking", String::new()),
             };
-            found(
-                Severity::Fault,
-                Cause::NotSent,
-                [
-                    format!("{given} was not sent{age}: {why}"),
-                    String::new(),
-                    "A command is sent at once or not at all".into(),
-                    "Give it again when the link to the command port is up and the commands before have their replies"
-                        .into(),
-                ],
-            )
+            Some(finding(
+                (Severity::Fault, &place, Cause::NotSent),
+                format!("{given} was not sent{age}: {why}"),
+                "",
+                "A command is sent at once or not at all",
+                "Give it again when the link to the command port is up and the commands before have their replies",
+            ))
         }
         _ => None,
     }

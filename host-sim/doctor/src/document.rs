@@ -141,9 +141,6 @@ impl StatusDocument {
     }
 
     /// What the gateway says. `up_for` is asked how long a link that is up has been so, as far as that is known.
-    ///
-    /// # Errors
-    /// If no engine can run the configuration.
     pub fn state(
         &self,
         config: &GatewayConfig,

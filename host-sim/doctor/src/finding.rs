@@ -230,7 +230,6 @@ impl Serialize for Finding {
     }
 }
 
-/// Makes a finding.
 pub(crate) fn finding(
     (severity, place, cause): (Severity, &FindingPlace, Cause),
     seen: impl Into<String>,

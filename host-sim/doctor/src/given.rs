@@ -6,11 +6,10 @@ use proto_core::sysvar::Direction;
 
 use crate::bytes::count;
 use crate::command::{REPORTED_FOR, ago, is_command};
-use crate::finding::{Cause, Finding, Severity};
+use crate::finding::{Cause, Finding};
 use crate::port_case::PortCase;
 use crate::state::Withheld;
 
-/// Looks at a port whose device gives commands.
 pub(crate) fn examine(seen: &PortCase<'_>, findings: &mut Vec<Finding>) {
     if !gives_commands(seen.case.config, seen.recipe) {
         return;
@@ -33,28 +32,24 @@ fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
         return None;
     }
     let (value, age) = (format!("value {value}"), ago(age));
-    let warning = |cause, words| Some(seen.found(Severity::Warning, cause, words));
     match why? {
-        DropReason::Based => warning(
+        DropReason::Based => Some(seen.warning(
             Cause::FirstValue,
-            [
-                format!("{value} gave no command{age}: it was the first after the start, silence, sleep or a lost device"),
-                "another value before it: the first one only sets the base".into(),
-                "A button was pressed in the first frame, or the device sends only changes".into(),
-                "Release it and press again. If the device sends only changes, write base = \"keep\" beside commands, \
-                 a longer timeout_ms, and level for a stop button"
-                    .into(),
-            ],
-        ),
-        DropReason::Unknown => warning(
+            format!(
+                "{value} gave no command{age}: it was the first after the start, silence, sleep or a lost device"
+            ),
+            "another value before it: the first one only sets the base",
+            "A button was pressed in the first frame, or the device sends only changes",
+            "Release it and press again. If the device sends only changes, write base = \"keep\" beside commands, \
+             a longer timeout_ms, and level for a stop button",
+        )),
+        DropReason::Unknown => Some(seen.warning(
             Cause::UnknownValue,
-            [
-                format!("{value} gave no command{age}: it is in no entry of the table"),
-                "a value of the table `commands`, or the idle one".into(),
-                "The device sends another number than the table has, or the field is at another place".into(),
-                "Add the value to `commands`, write it as `idle`, or correct the field".into(),
-            ],
-        ),
+            format!("{value} gave no command{age}: it is in no entry of the table"),
+            "a value of the table `commands`, or the idle one",
+            "The device sends another number than the table has, or the field is at another place",
+            "Add the value to `commands`, write it as `idle`, or correct the field",
+        )),
         // What was picked and not sent shows in the port's reply.
         _ => None,
     }
@@ -73,14 +68,13 @@ fn slept(seen: &PortCase<'_>) -> Option<Finding> {
         0 => "Input".to_owned(),
         _ => count(counted, "chunk") + " of input",
     };
-    Some(seen.found(
-        Severity::Warning,
+    Some(seen.warning(
         Cause::Slept,
-        [
-            format!("{chunks} discarded{age}: the gateway itself had slept, and what waited is of an unknown age"),
-            "a gateway that is called at least twice a second".into(),
-            "The machine was suspended or overloaded; a button that was pressed meanwhile gave no command".into(),
-            "Press again. A panel that sends only changes should repeat its frame while stop is held".into(),
-        ],
+        format!(
+            "{chunks} discarded{age}: the gateway itself had slept, and what waited is of an unknown age"
+        ),
+        "a gateway that is called at least twice a second",
+        "The machine was suspended or overloaded; a button that was pressed meanwhile gave no command",
+        "Press again. A panel that sends only changes should repeat its frame while stop is held",
     ))
 }

@@ -8,7 +8,6 @@ use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
 use crate::record::{LinkFacts, Reach};
 use crate::state;
 
-/// Looks at each link.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     for info in &case.status.links {
         // What the second connection to port 2000 lacks, the first carries.
@@ -35,13 +34,23 @@ impl LinkCase<'_> {
         &self,
         severity: Severity,
         cause: Cause,
-        [seen, expected, likely, remedy]: [String; 4],
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
     ) -> Finding {
         finding((severity, &self.place, cause), seen, expected, likely, remedy)
     }
 
-    fn fault(&self, cause: Cause, words: [String; 4]) -> Option<Finding> {
-        Some(self.found(Severity::Fault, cause, words))
+    fn fault(
+        &self,
+        cause: Cause,
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Option<Finding> {
+        Some(self.found(Severity::Fault, cause, seen, expected, likely, remedy))
     }
 
     fn to(&self) -> String {
@@ -100,36 +109,34 @@ impl LinkCase<'_> {
             _ => ("controller.address".to_owned(), format!("controller.ports.{key} of the file"), "pendant"),
         };
         match reach {
-            Some(Reach::Refused) => self.fault(Cause::Refused, [
+            Some(Reach::Refused) => self.fault(
+                Cause::Refused,
                 format!("{to} refuses the connection"),
                 expected,
-                "The machine is there and nobody listens at this port: another port number, or the service is off"
-                    .into(),
+                "The machine is there and nobody listens at this port: another port number, or the service is \
+                 off",
                 format!("Check {port}, and that the service is on at the {where_on}"),
-            ]),
-            Some(Reach::NoSuchHost) => self.fault(Cause::NoSuchHost, [
+            ),
+            Some(Reach::NoSuchHost) => self.fault(
+                Cause::NoSuchHost,
                 format!("the name {host} is not known"),
                 expected,
                 format!("{address} is misspelt, or no name server knows it"),
                 match self.info.kind {
-                    LinkKind::ModbusDevice { .. } => "Write the device's IP address".into(),
-                    _ => "Write the controller's IP address".into(),
+                    LinkKind::ModbusDevice { .. } => "Write the device's IP address",
+                    _ => "Write the controller's IP address",
                 },
-            ]),
-            Some(Reach::Failed(error)) => self.fault(Cause::Unreachable, [
+            ),
+            Some(Reach::Failed(error)) => self.fault(
+                Cause::Unreachable,
                 format!("{to}: {error}"),
                 expected,
-                "The network does not lead there".into(),
+                "The network does not lead there",
                 format!("Try `ping {host}`; check cable, address and mask"),
-            ]),
-            _ => self.fault(Cause::Unreachable, [
-                format!("no answer from {to}"),
-                expected,
-                format!(
+            ),
+            _ => self.fault(Cause::Unreachable, format!("no answer from {to}"), expected, format!(
                     "{address} is another machine's or nobody's, a cable is unplugged, or a firewall drops it"
-                ),
-                format!("Try `ping {host}`; check cable, address and mask"),
-            ]),
+                ), format!("Try `ping {host}`; check cable, address and mask")),
         }
     }
 
@@ -143,49 +150,38 @@ impl LinkCase<'_> {
             LinkKind::State if counters.malformed > 0 && counters.malformed >= counters.received => self
                 .fault(
                     Cause::Dialect,
-                    [
-                        format!("{to} sends {} bytes that are no state packets", counters.bytes_in),
-                        "packets of 1468 bytes".into(),
-                        "Another port, or a controller version with another packet".into(),
-                        format!("Check controller.ports.{key} and controller.dialect"),
-                    ],
+                    format!("{to} sends {} bytes that are no state packets", counters.bytes_in),
+                    "packets of 1468 bytes",
+                    "Another port, or a controller version with another packet",
+                    format!("Check controller.ports.{key} and controller.dialect"),
                 ),
             LinkKind::State if counters.received == 0 && (silences > 0 || since >= 1_500) => self.fault(
                 Cause::LinkSilent,
-                [
-                    format!("{to} is connected; {} bytes, 0 packets", counters.bytes_in),
-                    "ten packets a second".into(),
-                    format!("This is not {what}, or the controller is still starting"),
-                    format!("Check controller.ports.{key}"),
-                ],
+                format!("{to} is connected; {} bytes, 0 packets", counters.bytes_in),
+                "ten packets a second",
+                format!("This is not {what}, or the controller is still starting"),
+                format!("Check controller.ports.{key}"),
             ),
             LinkKind::Modbus if counters.refused > 0 && counters.refused >= counters.received => self.fault(
                 Cause::LinkRefuses,
-                [
-                    format!("{to} refuses {} of {} requests", counters.refused, counters.sent),
-                    "answers".into(),
-                    "The controller's Modbus map lacks these registers: another software version".into(),
-                    "Check controller.dialect, and the variables that `host-sim check` sends over Modbus"
-                        .into(),
-                ],
+                format!("{to} refuses {} of {} requests", counters.refused, counters.sent),
+                "answers",
+                "The controller's Modbus map lacks these registers: another software version",
+                "Check controller.dialect, and the variables that `host-sim check` sends over Modbus",
             ),
             LinkKind::Modbus if counters.timeouts > 0 && counters.received == 0 => self.fault(
                 Cause::LinkSilent,
-                [
-                    format!("{to} answers none of {} requests", counters.sent),
-                    "answers of a Modbus server".into(),
-                    format!("Something else than {what} listens there"),
-                    format!("Check controller.ports.{key}"),
-                ],
+                format!("{to} answers none of {} requests", counters.sent),
+                "answers of a Modbus server",
+                format!("Something else than {what} listens there"),
+                format!("Check controller.ports.{key}"),
             ),
             LinkKind::Command if counters.timeouts > 0 && counters.received == 0 => self.fault(
                 Cause::Dialect,
-                [
-                    format!("{to} replies to none of {} commands", counters.sent),
-                    "a reply to each".into(),
-                    format!("This is not {what}, or the controller wants another end of line"),
-                    format!("Check controller.ports.{key} and controller.dialect"),
-                ],
+                format!("{to} replies to none of {} commands", counters.sent),
+                "a reply to each",
+                format!("This is not {what}, or the controller wants another end of line"),
+                format!("Check controller.ports.{key} and controller.dialect"),
             ),
             _ => None,
         }
@@ -209,27 +205,20 @@ impl LinkCase<'_> {
             Some(Reach::Refused) => {
                 return self.fault(
                     Cause::Refused,
-                    [
-                        format!(
-                            "{} sent, {} received; {to} refuses datagrams",
-                            counters.sent, counters.received
-                        ),
-                        format!("{what} of the controller"),
-                        "The machine is there and nobody listens at this UDP port".into(),
-                        remedy,
-                    ],
+                    format!("{} sent, {} received; {to} refuses datagrams", counters.sent, counters.received),
+                    format!("{what} of the controller"),
+                    "The machine is there and nobody listens at this UDP port",
+                    remedy,
                 );
             }
             Some(Reach::Untried) => {
                 return Some(self.found(
                     Severity::Note,
                     Cause::OneWay,
-                    [
-                        format!("{to} was not tried: over UDP that takes a frame"),
-                        String::new(),
-                        "The controller is given nothing here".into(),
-                        "Run the gateway with -v, which tells whether the controller answers".into(),
-                    ],
+                    format!("{to} was not tried: over UDP that takes a frame"),
+                    "",
+                    "The controller is given nothing here",
+                    "Run the gateway with -v, which tells whether the controller answers",
                 ));
             }
             Some(Reach::NoSuchHost | Reach::Failed(_)) if !self.is_up() => return self.not_connected(reach),
@@ -244,23 +233,18 @@ impl LinkCase<'_> {
             Severity::Fault => self.found(
                 severity,
                 Cause::OneWay,
-                [
-                    seen,
-                    "the controller's frames: the recipe has an output part".into(),
-                    "Another UDP port than the controller's, no recipe assigned to it, or a firewall".into(),
-                    remedy,
-                ],
+                seen,
+                "the controller's frames: the recipe has an output part",
+                "Another UDP port than the controller's, no recipe assigned to it, or a firewall",
+                remedy,
             ),
             _ => self.found(
                 severity,
                 Cause::OneWay,
-                [
-                    seen,
-                    String::new(),
-                    "The recipe has no output part, so nothing shows whether the controller takes the frames"
-                        .into(),
-                    "An output part with any variable would show it".into(),
-                ],
+                seen,
+                "",
+                "The recipe has no output part, so nothing shows whether the controller takes the frames",
+                "An output part with any variable would show it",
             ),
         })
     }
@@ -272,13 +256,10 @@ impl LinkCase<'_> {
         let seconds = self.case.running.as_millis() / 1000;
         self.fault(
             Cause::NotConnected,
-            [
-                format!("nobody has connected to {} for {seconds} s", self.to()),
-                format!("the controller at {}", self.info.host),
-                "The controller's recipe client is off or has another address or port".into(),
-                "Enter this machine's address and this port at the pendant; open the port in the firewall"
-                    .into(),
-            ],
+            format!("nobody has connected to {} for {seconds} s", self.to()),
+            format!("the controller at {}", self.info.host),
+            "The controller's recipe client is off or has another address or port",
+            "Enter this machine's address and this port at the pendant; open the port in the firewall",
         )
     }
 
@@ -288,13 +269,10 @@ impl LinkCase<'_> {
             self.found(
                 Severity::Fault,
                 Cause::Stranger,
-                [
-                    format!("{strangers} connections or datagrams from other addresses"),
-                    format!("the controller at {}", self.info.host),
-                    "The controller has another address than the file says, or another machine connects"
-                        .into(),
-                    "Correct controller.address; the log of -v names the peer".into(),
-                ],
+                format!("{strangers} connections or datagrams from other addresses"),
+                format!("the controller at {}", self.info.host),
+                "The controller has another address than the file says, or another machine connects",
+                "Correct controller.address; the log of -v names the peer",
             )
         })
     }

@@ -6,11 +6,10 @@ use proto_core::modbus::Exception;
 use proto_core::schedule::Presence;
 
 use crate::bytes::{HexBytes, count};
-use crate::finding::{Cause, Finding, Severity};
+use crate::finding::{Cause, Finding};
 use crate::port_case::PortCase;
 use crate::state::Peer;
 
-/// Looks at each peer.
 pub(crate) fn examine(seen: &PortCase<'_>, findings: &mut Vec<Finding>) {
     let exchanges = seen.case.config.exchanges_of(seen.recipe);
     let is_served =
@@ -43,97 +42,78 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
         format!("{who} asked {} times, {} good replies", peer.counters.requests, peer.counters.replies);
     let bytes = seen.record.bytes();
     let expected = format!("replies of {who}");
-    let fault = |cause, words| seen.found(Severity::Fault, cause, words);
     if is_modbus {
         let frames = rtu_frames(&bytes);
         // A request that is heard is no reply: eight bytes of a function that only reads.
         let is_request = |frame: &&[u8]| frame.len() == 8 && (1..=4).contains(&frame[1]) && frame[2] != 3;
         if frames.iter().any(|frame| frame[0] == peer.number && is_request(frame)) {
-            return fault(
+            return seen.fault(
                 Cause::Echo,
-                [
-                    format!("{asked}; the request itself is heard"),
-                    expected,
-                    "The adapter hears what it sends".into(),
-                    "Write echo = true for the port, or switch the adapter's echo off".into(),
-                ],
+                format!("{asked}; the request itself is heard"),
+                expected,
+                "The adapter hears what it sends",
+                "Write echo = true for the port, or switch the adapter's echo off",
             );
         }
         let known = |number: u8| seen.status.peers.iter().any(|peer| peer.number == number);
         if let Some(frame) = frames.iter().find(|frame| !known(frame[0])) {
-            return fault(
+            return seen.fault(
                 Cause::PeerOther,
-                [
-                    format!(
-                        "{asked}; a right frame of slave {} is heard: {}",
-                        frame[0],
-                        HexBytes(shown(frame))
-                    ),
-                    expected,
-                    "The slave has another address".into(),
-                    format!(
-                        "Set the slave's address to {}, or write slave = {} in the recipe",
-                        peer.number, frame[0]
-                    ),
-                ],
+                format!("{asked}; a right frame of slave {} is heard: {}", frame[0], HexBytes(shown(frame))),
+                expected,
+                "The slave has another address",
+                format!(
+                    "Set the slave's address to {}, or write slave = {} in the recipe",
+                    peer.number, frame[0]
+                ),
             );
         }
     }
     // With settings that were right once, nothing but its power and its wires is left.
     if peer.counters.replies > peer.counters.checksums.saturating_mul(10) {
-        return fault(
+        return seen.fault(
             Cause::PeerSilent,
-            [
-                format!("{asked}; it has answered before, and does not any more"),
-                expected,
-                "It was switched off or unplugged, or a wire is open".into(),
-                "Check its power and its wires; it is asked again now and then".into(),
-            ],
+            format!("{asked}; it has answered before, and does not any more"),
+            expected,
+            "It was switched off or unplugged, or a wire is open",
+            "Check its power and its wires; it is asked again now and then",
         );
     }
     if peer.counters.checksums > 0 {
         return noise(seen, peer);
     }
     if !bytes.is_empty() && seen.counters.bytes_in > 0 && seen.status.peers.len() == 1 {
-        return fault(
+        return seen.fault(
             Cause::PeerSilent,
-            [
-                format!(
-                    "{asked}; {} heard: {}",
-                    count(seen.counters.bytes_in as usize, "byte"),
-                    HexBytes(shown(&bytes))
-                ),
-                expected,
-                "Something answers, and no reply is right: baud rate, parity, address or protocol".into(),
-                "Compare the settings of the port with the device's".into(),
-            ],
+            format!(
+                "{asked}; {} heard: {}",
+                count(seen.counters.bytes_in as usize, "byte"),
+                HexBytes(shown(&bytes))
+            ),
+            expected,
+            "Something answers, and no reply is right: baud rate, parity, address or protocol",
+            "Compare the settings of the port with the device's",
         );
     }
-    fault(
+    seen.fault(
         Cause::PeerSilent,
-        [
-            format!("{asked}; no byte of it"),
-            expected,
-            "It is off or has another address, baud rate or parity, or the wires A and B are open or swapped"
-                .into(),
-            "Check power, address and line settings of the device".into(),
-        ],
+        format!("{asked}; no byte of it"),
+        expected,
+        "It is off or has another address, baud rate or parity, or the wires A and B are open or swapped",
+        "Check power, address and line settings of the device",
     )
 }
 
 fn noise(seen: &PortCase<'_>, peer: Peer) -> Finding {
-    seen.found(
-        Severity::Fault,
+    seen.fault(
         Cause::ChecksumWrong,
-        [
-            format!(
-                "{} replies of {} with a wrong checksum, {} good ones",
-                peer.counters.checksums, peer.number, peer.counters.replies
-            ),
-            "replies with a right one".into(),
-            "Bytes are damaged: two slaves with one address, parity, or a bad line".into(),
-            "Check addresses, parity, ground and termination".into(),
-        ],
+        format!(
+            "{} replies of {} with a wrong checksum, {} good ones",
+            peer.counters.checksums, peer.number, peer.counters.replies
+        ),
+        "replies with a right one",
+        "Bytes are damaged: two slaves with one address, parity, or a bad line",
+        "Check addresses, parity, ground and termination",
     )
 }
 
@@ -142,21 +122,17 @@ fn refuses(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
         (true, code) if code > 0 => format!(": {} (code {code})", Exception::from_code(code)),
         _ => String::new(),
     };
-    seen.found(
-        Severity::Fault,
+    seen.fault(
         Cause::PeerRefuses,
-        [
-            format!(
-                "{} refuses {} of {} requests{why}",
-                name(peer, is_modbus),
-                peer.counters.refused,
-                peer.counters.requests
-            ),
-            "answers".into(),
-            "A register address, a count or a function is not the device's".into(),
-            "Compare the exchanges of the recipe with the device's manual; many count registers from 1"
-                .into(),
-        ],
+        format!(
+            "{} refuses {} of {} requests{why}",
+            name(peer, is_modbus),
+            peer.counters.refused,
+            peer.counters.requests
+        ),
+        "answers",
+        "A register address, a count or a function is not the device's",
+        "Compare the exchanges of the recipe with the device's manual; many count registers from 1",
     )
 }
 
@@ -169,15 +145,12 @@ fn served(seen: &PortCase<'_>, exchanges: &[Exchange], findings: &mut Vec<Findin
     let frames_of = seen.record.bytes();
     let frames = rtu_frames(&frames_of);
     if let Some(frame) = frames.iter().find(|frame| frame[0] != own && frame[0] != 0) {
-        findings.push(seen.found(
-            Severity::Fault,
+        findings.push(seen.fault(
             Cause::PeerOther,
-            [
-                format!("requests to slave {}: {}", frame[0], HexBytes(shown(frame))),
-                format!("requests to slave {own}"),
-                "The master asks another address".into(),
-                format!("Let the master ask slave {own}, or write slave = {} in the recipe", frame[0]),
-            ],
+            format!("requests to slave {}: {}", frame[0], HexBytes(shown(frame))),
+            format!("requests to slave {own}"),
+            "The master asks another address",
+            format!("Let the master ask slave {own}, or write slave = {} in the recipe", frame[0]),
         ));
     }
 }

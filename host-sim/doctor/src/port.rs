@@ -13,7 +13,6 @@ use crate::shape::Shape;
 use crate::stream::{self, Fit};
 use crate::{Case, can, checksum, given, peers, value};
 
-/// Looks at each field port.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     for status in &case.status.ports {
         let found = case.config.field_ports().find(|(index, ..)| PortId(*index) == status.id);
@@ -67,15 +66,12 @@ impl PortCase<'_> {
             "" => "its device".to_owned(),
             device => device.to_owned(),
         };
-        self.found(
-            Severity::Fault,
+        self.fault(
             Cause::DeviceGone,
-            [
-                format!("{device} is not there"),
-                String::new(),
-                "The adapter is unplugged, without power, or another program has it".into(),
-                "Plug it in; `ls -l /dev/serial/by-id` shows adapters, `ip link` shows CAN interfaces".into(),
-            ],
+            format!("{device} is not there"),
+            "",
+            "The adapter is unplugged, without power, or another program has it",
+            "Plug it in; `ls -l /dev/serial/by-id` shows adapters, `ip link` shows CAN interfaces",
         )
     }
 
@@ -147,36 +143,29 @@ impl PortCase<'_> {
         self.found(
             severity,
             Cause::NoBytes,
-            [
-                format!("0 bytes in {seconds} s{device}"),
-                expected,
-                "The device is off, does not send by itself, or the wires A and B are open or swapped".into(),
-                format!(
-                    "Check the power, the wires and the device's mode of output{}",
-                    if self.record.device.is_empty() { "" } else { "; make sure that this is its adapter" }
-                ),
-            ],
+            format!("0 bytes in {seconds} s{device}"),
+            expected,
+            "The device is off, does not send by itself, or the wires A and B are open or swapped",
+            format!(
+                "Check the power, the wires and the device's mode of output{}",
+                if self.record.device.is_empty() { "" } else { "; make sure that this is its adapter" }
+            ),
         )
     }
 
     fn no_input(&self) -> Finding {
         let bytes = self.bytes();
-        self.found(
-            Severity::Warning,
+        self.warning(
             Cause::NoInput,
-            [
-                format!("{}; first seen {}", self.came(), HexBytes(first(&bytes))),
-                "nothing: the recipe has no input part".into(),
-                "The device sends, and nobody listens".into(),
-                "Add [recipe.input] to the recipe, or assign another recipe to the port".into(),
-            ],
+            format!("{}; first seen {}", self.came(), HexBytes(first(&bytes))),
+            "nothing: the recipe has no input part",
+            "The device sends, and nobody listens",
+            "Add [recipe.input] to the recipe, or assign another recipe to the port",
         )
     }
 
-    /// Frames that were found and rejected.
     fn rejected(&self, shape: &Shape<'_>, bytes: &[u8]) -> Option<Finding> {
         let counters = &self.counters;
-        let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
         if self.are_many(counters.rejected_checksum) {
             let whole = self.status.rejection.as_ref().filter(|last| last.why == Rejection::Checksum);
             let whole = whole.filter(|last| last.len == last.bytes.len()).map(|last| last.bytes.as_slice());
@@ -188,40 +177,33 @@ impl PortCase<'_> {
                 counters.rejected_checksum
             );
             return match found {
-                Some(right) => fault(
+                Some(right) => Some(self.fault(
                     Cause::ChecksumKind,
-                    [
-                        seen,
-                        "the checksum of the recipe".into(),
-                        format!("The checksum is right as {right}"),
-                        "Write that in `checksum` of the recipe".into(),
-                    ],
-                ),
-                None => fault(
+                    seen,
+                    "the checksum of the recipe",
+                    format!("The checksum is right as {right}"),
+                    "Write that in `checksum` of the recipe",
+                )),
+                None => Some(self.fault(
                     Cause::ChecksumWrong,
-                    [
-                        seen,
-                        "the checksum of the recipe".into(),
-                        "Bytes are damaged on the line, or the checksum is of another kind or range".into(),
-                        "Compare with the device's manual: algorithm, first and last byte; check the wires"
-                            .into(),
-                    ],
-                ),
+                    seen,
+                    "the checksum of the recipe",
+                    "Bytes are damaged on the line, or the checksum is of another kind or range",
+                    "Compare with the device's manual: algorithm, first and last byte; check the wires",
+                )),
             };
         }
         if self.are_many(counters.rejected_other_device) {
             return self.other_device(shape);
         }
         if self.are_many(counters.rejected_counter) {
-            return fault(
+            return Some(self.fault(
                 Cause::Frozen,
-                [
-                    format!("{} frames with the counter of the frame before", counters.rejected_counter),
-                    "a counter that goes on".into(),
-                    "The device repeats an old frame: its program hangs".into(),
-                    "Restart the device".into(),
-                ],
-            );
+                format!("{} frames with the counter of the frame before", counters.rejected_counter),
+                "a counter that goes on",
+                "The device repeats an old frame: its program hangs",
+                "Restart the device",
+            ));
         }
         let unreadable = counters.rejected_unreadable.wrapping_add(counters.rejected_out_of_range);
         let values = unreadable.wrapping_add(counters.rejected_not_finite);
@@ -266,16 +248,12 @@ impl PortCase<'_> {
             name => format!("{name:?}"),
         };
         let command = format!("host-sim decode {FILE} --recipe {name} --part input {}", HexBytes(&frame));
-        self.found(
-            Severity::Fault,
+        self.fault(
             Cause::BadValue,
-            [
-                format!("{rejected}: {seen}"),
-                expected,
-                "A field's type, place or scale is not the device's, or scale and offset leave too small a range"
-                    .into(),
-                format!("Correct the field; its value in a frame: {}", command.trim_end()),
-            ],
+            format!("{rejected}: {seen}"),
+            expected,
+            "A field's type, place or scale is not the device's, or scale and offset leave too small a range",
+            format!("Correct the field; its value in a frame: {}", command.trim_end()),
         )
     }
 
@@ -299,15 +277,12 @@ impl PortCase<'_> {
             ),
             None => ("another constant".into(), "that of the recipe".into()),
         };
-        Some(self.found(
-            Severity::Fault,
+        Some(self.fault(
             Cause::OtherDevice,
-            [
-                format!("{} whole frames with {seen}", self.counters.rejected_other_device),
-                expected,
-                "The frames are right and of another device: its address or number is another one".into(),
-                "Set the device's address, or write its number in the recipe".into(),
-            ],
+            format!("{} whole frames with {seen}", self.counters.rejected_other_device),
+            expected,
+            "The frames are right and of another device: its address or number is another one",
+            "Set the device's address, or write its number in the recipe",
         ))
     }
 
@@ -322,15 +297,12 @@ impl PortCase<'_> {
         } else {
             format!("Write endian = \"{other}\" in the part or the field of the recipe")
         };
-        self.found(
-            Severity::Fault,
+        self.fault(
             Cause::ByteOrder,
-            [
-                format!("floats such as {read:e}; with their bytes reversed {swapped}"),
-                format!("{own}-endian floats"),
-                format!("The device sends {other}-endian"),
-                remedy,
-            ],
+            format!("floats such as {read:e}; with their bytes reversed {swapped}"),
+            format!("{own}-endian floats"),
+            format!("The device sends {other}-endian"),
+            remedy,
         )
     }
 
@@ -344,76 +316,61 @@ impl PortCase<'_> {
         if lost == 0 || !self.is_silent() {
             return self.broken_off(shape);
         }
-        let fault = |cause, words| Some(self.found(Severity::Fault, cause, words));
         let came = self.came();
         let hex = |bytes: &[u8]| HexBytes(bytes).to_string();
         let whole = shape.len.map_or(String::new(), |len| format!("frames of {len} bytes, "));
         let Some(fit) = stream::fit(shape, bytes) else { return self.broken_off(shape) };
         match fit {
-            Fit::HeadSwapped { seen } => fault(
+            Fit::HeadSwapped { seen } => Some(self.fault(
                 Cause::HeadSwapped,
-                [
-                    format!("{came}; first seen {}", hex(&seen)),
-                    format!("the head {}", hex(shape.head)),
-                    "The bytes of the head are swapped".into(),
-                    format!("Write head = {} in the recipe, or change the device", list(&seen)),
-                ],
-            ),
-            Fit::HeadDiffers { seen } => fault(
+                format!("{came}; first seen {}", hex(&seen)),
+                format!("the head {}", hex(shape.head)),
+                "The bytes of the head are swapped",
+                format!("Write head = {} in the recipe, or change the device", list(&seen)),
+            )),
+            Fit::HeadDiffers { seen } => Some(self.fault(
                 Cause::HeadDiffers,
-                [
-                    format!("{came}; frames begin with {}", hex(&seen)),
-                    format!("the head {}", hex(shape.head)),
-                    "The device's head is another one".into(),
-                    format!("Write head = {} in the recipe, or change the device", list(&seen)),
-                ],
-            ),
-            Fit::SevenBits => fault(
+                format!("{came}; frames begin with {}", hex(&seen)),
+                format!("the head {}", hex(shape.head)),
+                "The device's head is another one",
+                format!("Write head = {} in the recipe, or change the device", list(&seen)),
+            )),
+            Fit::SevenBits => Some(self.fault(
                 Cause::SevenBits,
-                [
-                    format!("{came}; first seen {}", hex(first(bytes))),
-                    format!("the head {}", hex(shape.head)),
-                    "The head is there without bit 7: the device sends 7 data bits and parity".into(),
-                    "Set the device to 8 data bits".into(),
-                ],
-            ),
-            Fit::TailDiffers { seen } => fault(
+                format!("{came}; first seen {}", hex(first(bytes))),
+                format!("the head {}", hex(shape.head)),
+                "The head is there without bit 7: the device sends 7 data bits and parity",
+                "Set the device to 8 data bits",
+            )),
+            Fit::TailDiffers { seen } => Some(self.fault(
                 Cause::TailDiffers,
-                [
-                    format!("{came}; frames end with {}", hex(&seen)),
-                    format!("the tail {}", hex(shape.tail)),
-                    "The device's tail is another one, or the fields have another order or types".into(),
-                    format!("Write tail = {} in the recipe, or correct its fields", list(&seen)),
-                ],
-            ),
+                format!("{came}; frames end with {}", hex(&seen)),
+                format!("the tail {}", hex(shape.tail)),
+                "The device's tail is another one, or the fields have another order or types",
+                format!("Write tail = {} in the recipe, or correct its fields", list(&seen)),
+            )),
             Fit::Length { seen } => {
                 let len = shape.len.unwrap_or(0);
                 let (by, word) = (seen.abs_diff(len), if seen > len { "longer" } else { "shorter" });
-                fault(
+                Some(self.fault(
                     Cause::LengthDiffers,
-                    [
-                        format!("{came}; frames of {seen} bytes"),
-                        format!("{whole}head and tail included"),
-                        format!("The device's frame is {} {word}", count(by, "byte")),
-                        "Correct the fields of the recipe: one is missing, too many, or of another type"
-                            .into(),
-                    ],
-                )
+                    format!("{came}; frames of {seen} bytes"),
+                    format!("{whole}head and tail included"),
+                    format!("The device's frame is {} {word}", count(by, "byte")),
+                    "Correct the fields of the recipe: one is missing, too many, or of another type",
+                ))
             }
-            Fit::BrokenOff { seen } => fault(
+            Fit::BrokenOff { seen } => Some(self.fault(
                 Cause::BrokenOff,
-                [
-                    format!("{came}; after the head {} came {seen} bytes, then silence", hex(shape.head)),
-                    format!("{whole}without a pause"),
-                    "The frame is shorter than the recipe says, or the device pauses within it".into(),
-                    "Correct the fields of the recipe, or raise idle_gap_ms of the port".into(),
-                ],
-            ),
-            Fit::NoHead => fault(Cause::NoHead, self.no_head(shape, bytes, came)),
+                format!("{came}; after the head {} came {seen} bytes, then silence", hex(shape.head)),
+                format!("{whole}without a pause"),
+                "The frame is shorter than the recipe says, or the device pauses within it",
+                "Correct the fields of the recipe, or raise idle_gap_ms of the port",
+            )),
+            Fit::NoHead => Some(self.no_head(shape, bytes, &came)),
         }
     }
 
-    /// A piece of a frame, and nothing since.
     fn broken_off(&self, shape: &Shape<'_>) -> Option<Finding> {
         let last = self.status.rejection.as_ref();
         let last = last.filter(|last| last.why == Rejection::Partial && last.age < REPORTED_FOR)?;
@@ -431,24 +388,24 @@ impl PortCase<'_> {
             tail => format!("frames of {whole} bytes without a pause, which end with {}", HexBytes(tail)),
         };
         let (age, bytes) = (ago(last.age), HexBytes(first(&last.bytes)));
-        Some(self.found(
-            Severity::Warning,
+        let seen = match last.bytes.ends_with(shape.tail) && !shape.tail.is_empty() {
+            true => {
+                let came = count(last.len, "byte");
+                format!("{came} came behind a silence within a frame{age}: {bytes}")
+            }
+            false => format!("{} of {whole} bytes{age}, then silence: {bytes}", last.len),
+        };
+        Some(self.warning(
             Cause::BrokenOff,
-            [
-                match last.bytes.ends_with(shape.tail) && !shape.tail.is_empty() {
-                    true => format!("{} came behind a silence within a frame{age}: {bytes}", count(last.len, "byte")),
-                    false => format!("{} of {whole} bytes{age}, then silence: {bytes}", last.len),
-                },
-                expected,
-                "The device's frame is shorter than the recipe says or ends otherwise, the device pauses within it, or \
-                 was switched off"
-                    .into(),
-                "Correct the fields, the lengths or the tail of the recipe, or raise idle_gap_ms of the port".into(),
-            ],
+            seen,
+            expected,
+            "The device's frame is shorter than the recipe says or ends otherwise, the device pauses within it, or \
+             was switched off",
+            "Correct the fields, the lengths or the tail of the recipe, or raise idle_gap_ms of the port",
         ))
     }
 
-    fn no_head(&self, shape: &Shape<'_>, bytes: &[u8], came: String) -> [String; 4] {
+    fn no_head(&self, shape: &Shape<'_>, bytes: &[u8], came: &str) -> Finding {
         let high = bytes.iter().filter(|byte| **byte > 0x7F).count() * 100 / bytes.len().max(1);
         let edge = bytes
             .iter()
@@ -476,15 +433,16 @@ impl PortCase<'_> {
         } else {
             "Bytes arrive, no head: baud rate or parity, or another protocol"
         };
-        [
+        self.fault(
+            Cause::NoHead,
             format!("{came}; first seen {}; {high} % of the bytes above 7F", HexBytes(first(bytes))),
             match shape.head {
                 [] => format!("the tail {}", HexBytes(shape.tail)),
                 head => format!("the head {}", HexBytes(head)),
             },
-            likely.into(),
+            likely,
             format!("Compare baud rate, parity and stop bits with the device's; the port has {settings}"),
-        ]
+        )
     }
 
     /// Frames come, and others are damaged.
@@ -498,21 +456,17 @@ impl PortCase<'_> {
         let bad = bad.into_iter().max().unwrap_or(0);
         let is_much = bad >= 5 && bad.saturating_mul(10) > counters.frames_in;
         is_much.then(|| {
-            self.found(
-                Severity::Warning,
+            self.warning(
                 Cause::Noise,
-                [
-                    format!("{} right frames and {bad} damaged ones", counters.frames_in),
-                    "right frames only".into(),
-                    "Bytes are lost or damaged on the line, or the head occurs within the data".into(),
-                    "Check ground, shield and termination of the line; a longer head helps".into(),
-                ],
+                format!("{} right frames and {bad} damaged ones", counters.frames_in),
+                "right frames only",
+                "Bytes are lost or damaged on the line, or the head occurs within the data",
+                "Check ground, shield and termination of the line; a longer head helps",
             )
         })
     }
 }
 
-/// A few bytes to show.
 fn first(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(SHOWN)]
 }

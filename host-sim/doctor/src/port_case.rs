@@ -20,13 +20,37 @@ pub(crate) struct PortCase<'a> {
 }
 
 impl PortCase<'_> {
-    /// Makes a finding about the port.
     pub(crate) fn found(
         &self,
         severity: Severity,
         cause: Cause,
-        [seen, expected, likely, remedy]: [String; 4],
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
     ) -> Finding {
         finding((severity, &self.place, cause), seen, expected, likely, remedy)
+    }
+
+    pub(crate) fn fault(
+        &self,
+        cause: Cause,
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        self.found(Severity::Fault, cause, seen, expected, likely, remedy)
+    }
+
+    pub(crate) fn warning(
+        &self,
+        cause: Cause,
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        self.found(Severity::Warning, cause, seen, expected, likely, remedy)
     }
 }

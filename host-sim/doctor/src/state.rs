@@ -19,7 +19,6 @@ pub struct State {
     pub(crate) controller: Option<States>,
 }
 
-/// A field port.
 #[derive(Debug, Clone)]
 pub(crate) struct ObservedPort {
     pub(crate) id: PortId,
@@ -32,7 +31,6 @@ pub(crate) struct ObservedPort {
     pub(crate) reply: ReplyCode,
     /// The newest command that one of its values picked, such as `run(pick.jspf)`.
     pub(crate) command: Option<String>,
-    /// The newest value that gave no command.
     pub(crate) not_given: Option<Withheld>,
     pub(crate) failed: Option<FailedCommand>,
     pub(crate) rejection: Option<Rejected>,
@@ -45,10 +43,8 @@ pub(crate) struct ObservedPort {
 pub(crate) struct Withheld {
     /// The reason, if it is one that this program knows.
     pub(crate) why: Option<DropReason>,
-    /// The reason in words.
     pub(crate) text: String,
     pub(crate) value: i64,
-    /// How long ago that was.
     pub(crate) age: Duration,
 }
 
@@ -65,7 +61,6 @@ pub(crate) struct FailedCommand {
 #[derive(Debug, Clone)]
 pub(crate) struct Rejected {
     pub(crate) why: Rejection,
-    /// How long ago it was.
     pub(crate) age: Duration,
     /// Length of what was rejected.
     pub(crate) len: usize,
@@ -81,7 +76,6 @@ pub(crate) struct Peer {
     pub(crate) counters: PeerCounters,
 }
 
-/// A link to the controller.
 #[derive(Debug, Clone)]
 pub(crate) struct ObservedLink {
     pub(crate) id: LinkId,
@@ -102,7 +96,6 @@ pub(crate) struct ObservedLink {
 #[derive(Debug, Clone)]
 pub(crate) struct OtherText {
     pub(crate) text: String,
-    /// How long ago it came.
     pub(crate) age: Duration,
     /// The unanswered command whose reply it may be.
     pub(crate) command: Option<String>,

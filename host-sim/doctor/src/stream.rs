@@ -8,18 +8,27 @@ use proto_core::device::ByteOrder;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Fit {
     /// The head's bytes in the other order.
-    HeadSwapped { seen: Vec<u8> },
+    HeadSwapped {
+        seen: Vec<u8>,
+    },
     /// Frames of the right length and with the tail begin with other bytes.
-    HeadDiffers { seen: Vec<u8> },
+    HeadDiffers {
+        seen: Vec<u8>,
+    },
     /// The head is there when bit 7 is left out.
     SevenBits,
     /// Frames of the right length end with other bytes.
-    TailDiffers { seen: Vec<u8> },
+    TailDiffers {
+        seen: Vec<u8>,
+    },
     /// Frames of another length.
-    Length { seen: usize },
+    Length {
+        seen: usize,
+    },
     /// A head, and too few bytes behind it.
-    BrokenOff { seen: usize },
-    /// No frame begins.
+    BrokenOff {
+        seen: usize,
+    },
     NoHead,
 }
 

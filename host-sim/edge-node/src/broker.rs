@@ -63,7 +63,6 @@ impl Broker {
         format!("{}:{}", self.host, self.port)
     }
 
-    /// Connects.
     pub(crate) async fn connect(&self) -> io::Result<Box<dyn BrokerConnection>> {
         let (host, port) = (self.host.clone(), self.port);
         let resolve = move || (host.as_str(), port).to_socket_addrs();

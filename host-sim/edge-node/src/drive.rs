@@ -235,7 +235,6 @@ impl SessionDriver {
     }
 }
 
-/// The system's clock, unless it was never set.
 fn utc_ms() -> Option<u64> {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).ok()?;
     u64::try_from(since.as_millis()).ok().filter(|ms| *ms >= OF_2024)

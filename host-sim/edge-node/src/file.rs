@@ -22,7 +22,6 @@ pub struct PublisherConfig {
     pub sample: Duration,
     /// Where the number of the session is kept.
     pub bd_seq: Option<PathBuf>,
-    /// Exceptions for variables.
     rules: Vec<PublishRule>,
     file: SparkplugFile,
 }
@@ -117,9 +116,6 @@ pub fn read_bd_seq(path: &Path) -> Result<Option<u8>, String> {
 }
 
 /// Keeps the number of a session: the file is there whole, before or after.
-///
-/// # Errors
-/// If it cannot be written.
 pub fn write_bd_seq(path: &Path, number: u8) -> std::io::Result<()> {
     Beside::file(path, format!("{number}\n").as_bytes())?.0.replace(path)
 }

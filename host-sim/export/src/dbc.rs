@@ -78,9 +78,6 @@ impl From<Collision> for DbcError {
 }
 
 /// The database of all CAN ports, or of the one called `port`.
-///
-/// # Errors
-/// [`DbcError`].
 pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
     let can = || model.ports.iter().filter(|port| matches!(port.bus, BusModel::Can { .. }));
     let known = || can().map(|port| port.name.clone()).collect::<Vec<_>>();
@@ -102,7 +99,6 @@ pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
     Ok(writer.finish(&ports))
 }
 
-/// All frames with one id.
 struct DbcMessage<'m> {
     id: CanId,
     recipe: &'m str,
@@ -140,6 +136,7 @@ fn number(id: CanId) -> u32 {
     }
 }
 
+#[derive(Default)]
 struct DbcWriter {
     owner: &'static str,
     nodes: Names,
@@ -154,7 +151,6 @@ struct DbcWriter {
     notes: Vec<String>,
 }
 
-/// Where and how a signal is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct SignalShape {
     start: usize,
@@ -172,19 +168,10 @@ impl DbcWriter {
                 Owner::Gateway => "Gateway",
                 Owner::Controller => "Controller",
             },
-            nodes: Names::default(),
-            message_names: Names::default(),
-            messages: String::new(),
-            comments: String::new(),
-            attributes: String::new(),
-            value_names: String::new(),
-            value_types: String::new(),
-            multiplexed: String::new(),
-            notes: Vec::new(),
+            ..Self::default()
         }
     }
 
-    /// The node at the other end of a port.
     fn device(&mut self, port: &PortModel) -> Result<String, Collision> {
         self.nodes.add(&format!("{}-device", port.name))
     }
@@ -262,7 +249,6 @@ impl DbcWriter {
         Ok(())
     }
 
-    /// The signals of one frame.
     fn signals(
         &mut self,
         scope: &mut Scope,
@@ -366,7 +352,6 @@ impl DbcWriter {
     }
 }
 
-/// The signals of one message.
 struct Scope {
     id: u32,
     receiver: String,

@@ -172,17 +172,11 @@ impl FrameField {
 
 impl Model {
     /// Reads a file of either kind.
-    ///
-    /// # Errors
-    /// The first mistake in the file, with its place.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, FileError> {
         file::with_text(path, |text| Self::parse(text, overrides))
     }
 
     /// Same as [`Model::load`], from a text.
-    ///
-    /// # Errors
-    /// The first mistake in the text, with its place.
     pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Self, FileError> {
         let config = file::parse(text, overrides)?;
         let recipes = file::parse_recipes(text, overrides)?;

@@ -26,7 +26,7 @@ use clients::{serve, serve_all};
 
 /// A bus; a clone is the same bus.
 #[derive(Debug, Clone)]
-pub struct CanBus {
+pub(crate) struct CanBus {
     shared: Rc<BusState>,
 }
 
@@ -54,16 +54,15 @@ struct NodeState {
 
 /// Transmissions of a node since the last report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct SentFrames {
-    /// Frames.
-    pub frames: u64,
+pub(crate) struct SentFrames {
+    pub(crate) frames: u64,
     /// Their data bytes.
-    pub bytes: u64,
+    pub(crate) bytes: u64,
 }
 
 impl CanBus {
     /// A bus without nodes. Frames that they drop are counted at `tx`; they take their time on `clock`.
-    pub fn new(pacing: Pacing, tx: Rc<PortTx>, clock: Clock) -> Self {
+    pub(crate) fn new(pacing: Pacing, tx: Rc<PortTx>, clock: Clock) -> Self {
         let wire = RefCell::new(Wire::new(pacing));
         let (nodes, deadline_moved) = (RefCell::default(), Notify::new());
         Self { shared: Rc::new(BusState { wire, nodes, deadline_moved, clock, tx }) }
@@ -74,7 +73,7 @@ impl CanBus {
     }
 
     /// Adds a node that receives all frames.
-    pub fn join(&self) -> BusNode {
+    pub(crate) fn join(&self) -> BusNode {
         let state = Rc::new(NodeState {
             id: self.shared.wire.borrow_mut().join(),
             queue: RefCell::default(),
@@ -89,10 +88,7 @@ impl CanBus {
     }
 
     /// Advances the bus with the clock until dropped.
-    ///
-    /// # Errors
-    /// As [`Clock::alarm`] and [`Alarm::expired`](crate::clock::Alarm::expired).
-    pub async fn run(&self) -> io::Result<()> {
+    pub(crate) async fn run(&self) -> io::Result<()> {
         let timer = self.shared.clock.alarm()?;
         loop {
             let deadline = self.shared.wire.borrow().deadline();
@@ -109,7 +105,7 @@ impl CanBus {
 
     /// Delivers the frames that were transmitted by now to every receiving node except the sender. A node
     /// with [`MAX_WAITING`] frames waiting drops and counts a frame.
-    pub fn advance(&self, now: Instant) {
+    pub(crate) fn advance(&self, now: Instant) {
         loop {
             let transmitted = self.shared.wire.borrow_mut().poll(now);
             let Some(Transmitted { from, frame, at }) = transmitted else { return };
@@ -139,17 +135,14 @@ impl CanBus {
 
 /// A node of a bus. Dropping it removes it from the bus and drops its waiting frames.
 #[derive(Debug)]
-pub struct BusNode {
+pub(crate) struct BusNode {
     bus: CanBus,
     state: Rc<NodeState>,
 }
 
 impl BusNode {
     /// Queues a frame for transmission.
-    ///
-    /// # Errors
-    /// [`Full`] if too many wait.
-    pub fn send(&self, now: Instant, frame: CanFrame) -> Result<(), Full> {
+    pub(crate) fn send(&self, now: Instant, frame: CanFrame) -> Result<(), Full> {
         let wire = &self.bus.shared.wire;
         self.bus.advance(now);
         let before = wire.borrow().deadline();
@@ -162,17 +155,17 @@ impl BusNode {
     }
 
     /// Whether the next frame would be refused.
-    pub fn is_full(&self) -> bool {
+    pub(crate) fn is_full(&self) -> bool {
         self.bus.shared.wire.borrow().is_full(self.state.id)
     }
 
     /// Number of frames of this node that have not been transmitted.
-    pub fn waiting(&self) -> usize {
+    pub(crate) fn waiting(&self) -> usize {
         self.bus.shared.wire.borrow().waiting(self.state.id)
     }
 
     /// Waits until frames of this node have been transmitted, and returns their number. Cancel safe.
-    pub async fn sent(&self) -> SentFrames {
+    pub(crate) async fn sent(&self) -> SentFrames {
         loop {
             let sent = self.state.sent.take();
             if sent.frames > 0 {
@@ -183,12 +176,12 @@ impl BusNode {
     }
 
     /// The next received frame, with the time of its end.
-    pub fn try_recv(&self) -> Option<(Instant, CanFrame)> {
+    pub(crate) fn try_recv(&self) -> Option<(Instant, CanFrame)> {
         self.state.queue.borrow_mut().pop_front()
     }
 
     /// Waits for the next frame. Cancel safe.
-    pub async fn recv(&self) -> (Instant, CanFrame) {
+    pub(crate) async fn recv(&self) -> (Instant, CanFrame) {
         loop {
             if let Some(frame) = self.try_recv() {
                 return frame;
@@ -198,7 +191,7 @@ impl BusNode {
     }
 
     /// Starts or stops receiving frames of other nodes. Stopping drops those that wait.
-    pub fn set_receiving(&self, is_receiving: bool) {
+    pub(crate) fn set_receiving(&self, is_receiving: bool) {
         self.state.is_receiving.set(is_receiving);
         if !is_receiving {
             self.state.queue.borrow_mut().clear();
@@ -206,7 +199,7 @@ impl BusNode {
     }
 
     /// Number of received frames dropped because too many waited.
-    pub fn dropped(&self) -> u64 {
+    pub(crate) fn dropped(&self) -> u64 {
         self.state.dropped.get()
     }
 }
@@ -229,7 +222,6 @@ pub(super) struct CanPort {
     bitrate: u32,
     pacing: Pacing,
     tx: Rc<PortTx>,
-    /// The clock of the bus.
     pub(super) clock: Clock,
 }
 
@@ -382,7 +374,7 @@ fn hand_over(node: &BusNode, tx: &PortTx) {
 }
 
 /// Maximum number of received frames that wait at one node.
-pub const MAX_WAITING: usize = 256;
+pub(crate) const MAX_WAITING: usize = 256;
 
 #[cfg(test)]
 #[path = "can_bus_tests.rs"]

@@ -123,9 +123,6 @@ impl Clock {
     }
 
     /// An alarm without a deadline, in the current tokio runtime.
-    ///
-    /// # Errors
-    /// As [`Timer::new`].
     pub fn alarm(&self) -> io::Result<Alarm> {
         let waits = match &*self.0 {
             ClockKind::Real | ClockKind::Scaled(_) => Waits::Timer(Timer::new()?),
@@ -171,9 +168,6 @@ enum Waits {
 
 impl Alarm {
     /// Moves the deadline. One in the past expires at once; [`Instant::NEVER`] disarms the alarm.
-    ///
-    /// # Errors
-    /// As [`Timer::arm`].
     pub fn arm(&self, deadline: Instant) -> io::Result<()> {
         self.armed.set(deadline);
         match (&self.waits, &*self.clock.0) {
@@ -190,9 +184,6 @@ impl Alarm {
     }
 
     /// Waits until the deadline has passed; the alarm is disarmed then. Cancel safe.
-    ///
-    /// # Errors
-    /// As [`Timer::expired`].
     pub async fn expired(&self) -> io::Result<()> {
         loop {
             match &self.waits {

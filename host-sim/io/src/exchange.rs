@@ -44,7 +44,6 @@ pub struct PortTx {
     pub(super) log_limit: LogLimit,
     /// Data read before this instant may have waited while the process slept.
     stale_until: Cell<Instant>,
-    /// How often the process slept.
     sleeps: Cell<u32>,
     /// The device has failed and is not handed over.
     pub(super) has_failed: Cell<bool>,

@@ -13,7 +13,7 @@ compile_error!(
 
 pub mod backoff;
 pub mod bind;
-pub mod can_bus;
+mod can_bus;
 pub mod clock;
 pub mod connect;
 pub mod exchange;
@@ -22,9 +22,9 @@ pub mod files;
 pub mod handover;
 pub mod log_limit;
 pub mod port;
-pub mod pty;
+mod pty;
 pub mod random;
-pub mod reactor;
+mod reactor;
 pub mod realtime;
 mod serial;
 mod socketcan;
@@ -35,4 +35,4 @@ pub mod tcp_options;
 mod test_kit;
 pub mod timer;
 mod tty;
-pub mod wire;
+mod wire;

@@ -56,9 +56,6 @@ impl OpenPort {
 
     /// As [`Self::open`], but takes over the previous owner's device if it matches: clients stay connected, and what
     /// they sent in between is dropped. Otherwise that device is closed first.
-    ///
-    /// # Errors
-    /// As [`Self::open`].
     pub async fn open_or_adopt(
         device: &Device,
         bus: BusSettings,

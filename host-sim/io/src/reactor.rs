@@ -10,7 +10,7 @@ use tokio::io::unix::AsyncFd;
 ///
 /// # Errors
 /// If the reactor refuses it, as it does a regular file.
-pub fn register(fd: OwnedFd, interest: Interest) -> io::Result<AsyncFd<OwnedFd>> {
+pub(crate) fn register(fd: OwnedFd, interest: Interest) -> io::Result<AsyncFd<OwnedFd>> {
     // SAFETY: an `OwnedFd` is open and its number never changes; the `AsyncFd` owns it, so it is
     // deregistered before it is closed.
     Ok(unsafe { AsyncFd::register_with_interest(fd, interest) }?)

@@ -27,7 +27,6 @@ use crate::tcp_options;
 use crate::timer::now;
 use crate::tty::Tty;
 
-/// A serial port's device.
 #[derive(Debug)]
 pub(super) struct SerialPort {
     source: SerialSource,
@@ -261,11 +260,9 @@ async fn pump<D: ByteStream>(
 
 /// What a port waits for, other than bytes.
 enum Other {
-    /// The process slept.
     Slept,
     /// Received bytes are requested from the driver.
     Looked,
-    /// There is something to send.
     HandedOver,
     /// The transmission can go on.
     Due(io::Result<()>),

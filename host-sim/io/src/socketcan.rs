@@ -32,7 +32,6 @@ use crate::log_limit::LogLimit;
 use crate::reactor::register;
 use crate::timer::{Timer, now};
 
-/// A port on an interface of the kernel.
 #[derive(Debug)]
 pub(super) struct KernelCan {
     interface: String,
@@ -478,7 +477,6 @@ const RETRY: Duration = Duration::from_micros(250);
 const MAX_REFUSED: Duration = Duration::from_millis(100);
 /// Time after which a frame's echo may have been lost.
 const ECHO_TIMEOUT: Duration = Duration::from_millis(20);
-/// Maximum number of frames read before other tasks run.
 const BATCH: usize = 64;
 /// Bytes: half a second of a full bus at 500 kbit/s. Without privileges the system allows a fifth of it.
 const RECEIVE_BUFFER: i32 = 1_024 * 1_024;

@@ -10,7 +10,6 @@ use tracing::warn;
 
 use super::bind::HostPort;
 use super::exchange::PortTx;
-use super::pty::Pty;
 use crate::tcp_options;
 use crate::timer::now;
 use crate::tty::Tty;
@@ -49,42 +48,6 @@ pub(super) trait ByteStream {
     /// drops them.
     fn may_hold_unread(&self) -> bool {
         false
-    }
-}
-
-impl ByteStream for Pty {
-    const LOSSY: bool = true;
-    const LATE: bool = true;
-
-    async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        loop {
-            self.readable().await?;
-            match self.try_read(buf) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                read => return read,
-            }
-        }
-    }
-    fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        Self::try_read(self, buf)
-    }
-    async fn writable(&self) -> io::Result<()> {
-        Self::writable(self).await
-    }
-    fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        Self::try_write(self, bytes)
-    }
-    fn has_unread(&self) -> bool {
-        Self::has_unread(self)
-    }
-    fn discard_unread(&self) {
-        Self::discard_unread(self);
-    }
-    fn has_client(&self) -> bool {
-        Self::has_client(self)
-    }
-    fn may_hold_unread(&self) -> bool {
-        Self::may_hold_unread(self)
     }
 }
 

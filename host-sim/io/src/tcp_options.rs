@@ -66,17 +66,11 @@ pub fn deliver_in_time(stream: &TcpStream, timeout: Duration) {
 
 /// However the connection ends from now on, even with this process, it is reset: data that the peer has not
 /// received by then is dropped.
-///
-/// # Errors
-/// If the system refuses the option.
 pub fn reset_on_close(stream: &TcpStream) -> io::Result<()> {
     stream.set_zero_linger()
 }
 
 /// Number of written bytes that the peer has not acknowledged (SIOCOUTQ); of a terminal, that have not left (TIOCOUTQ).
-///
-/// # Errors
-/// If the system does not know.
 pub fn unacknowledged(stream: impl AsFd) -> io::Result<usize> {
     let mut count: libc::c_int = 0;
     // SAFETY: the descriptor is open while it is borrowed; the call writes one int to `count`, which

@@ -19,7 +19,6 @@ use super::exchange::{PortEvent, PortTx};
 use super::port::{BusSettings, OpenPort};
 use crate::timer::now;
 
-/// A device's event.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Seen {
     Up,
@@ -71,7 +70,6 @@ impl PortTask {
         Self { place, tx, log, task }
     }
 
-    /// The next event and its time.
     pub(super) async fn next(&self) -> (Instant, Seen) {
         loop {
             if !self.log.events.borrow().is_empty() {
@@ -97,7 +95,6 @@ impl PortTask {
         }
     }
 
-    /// The next `count` bytes, in chunks of any size.
     pub(super) async fn bytes(&self, count: usize) -> Vec<u8> {
         let mut all = Vec::new();
         while all.len() < count {
@@ -148,7 +145,6 @@ impl TerminalClient {
         Self(OpenOptions::new().read(true).write(true).custom_flags(flags).open(link).unwrap())
     }
 
-    /// All bytes that can be read now.
     pub(super) fn read(&mut self) -> Vec<u8> {
         let mut buf = vec![0; 4_096];
         match self.0.read(&mut buf) {
@@ -161,7 +157,6 @@ impl TerminalClient {
         buf
     }
 
-    /// Reads `count` bytes, while the port's task runs.
     pub(super) async fn read_exact(&mut self, count: usize) -> Vec<u8> {
         let mut all = Vec::new();
         while all.len() < count {

@@ -52,9 +52,6 @@ impl Timer {
     }
 
     /// Moves the deadline. One in the past expires at once; [`Instant::NEVER`] disarms the timer.
-    ///
-    /// # Errors
-    /// As `timerfd_settime`, which refuses no instant.
     pub fn arm(&self, deadline: Instant) -> io::Result<()> {
         if deadline == self.armed.get() {
             return Ok(());
@@ -97,9 +94,6 @@ impl Timer {
     }
 
     /// Waits until `deadline`. Cancel safe; leaves the timer armed when cancelled.
-    ///
-    /// # Errors
-    /// As [`Timer::arm`] and [`Timer::expired`].
     pub async fn sleep_until(&self, deadline: Instant) -> io::Result<()> {
         self.arm(deadline)?;
         self.expired().await
@@ -117,17 +111,11 @@ pub struct Grid {
 
 impl Grid {
     /// A grid whose first tick is at `first`. A period of zero means one microsecond.
-    ///
-    /// # Errors
-    /// As [`Timer::new`].
     pub fn new(first: Instant, period: Duration) -> io::Result<Self> {
         Ok(Self { timer: Timer::new()?, next: first, period: period.max(Duration::from_micros(1)) })
     }
 
     /// Waits for the next tick. Cancel safe.
-    ///
-    /// # Errors
-    /// As [`Timer::expired`].
     pub async fn tick(&mut self) -> io::Result<GridTick> {
         self.timer.sleep_until(self.next).await?;
         let late = now().saturating_since(self.next);

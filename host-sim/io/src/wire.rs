@@ -11,7 +11,7 @@ use proto_core::wire::can::{CanFrame, CanId};
 
 /// How long frames take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Pacing {
+pub(crate) enum Pacing {
     /// None at all: a frame is transmitted as soon as it is queued.
     AtOnce,
     /// As long as their bits take at this rate, in bit/s.
@@ -20,26 +20,24 @@ pub enum Pacing {
 
 /// A node of the bus; one that joined later is greater.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub struct NodeId(u64);
+pub(crate) struct NodeId(u64);
 
 /// A frame that was transmitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Transmitted {
-    /// The sender.
-    pub from: NodeId,
-    /// The frame.
-    pub frame: CanFrame,
+pub(crate) struct Transmitted {
+    pub(crate) from: NodeId,
+    pub(crate) frame: CanFrame,
     /// The end of the transmission.
-    pub at: Instant,
+    pub(crate) at: Instant,
 }
 
 /// The node has [`MAX_QUEUED`] frames waiting already; the frame was not queued.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Full;
+pub(crate) struct Full;
 
 /// The medium, and the frames that wait for it.
 #[derive(Debug)]
-pub struct Wire {
+pub(crate) struct Wire {
     pacing: Pacing,
     nodes: BTreeMap<NodeId, VecDeque<QueuedFrame>>,
     joined: u64,
@@ -64,7 +62,7 @@ struct InProgress {
 
 impl Wire {
     /// An idle bus without nodes.
-    pub fn new(pacing: Pacing) -> Self {
+    pub(crate) fn new(pacing: Pacing) -> Self {
         Self {
             pacing,
             nodes: BTreeMap::new(),
@@ -74,8 +72,7 @@ impl Wire {
         }
     }
 
-    /// Adds a node.
-    pub fn join(&mut self) -> NodeId {
+    pub(crate) fn join(&mut self) -> NodeId {
         let id = NodeId(self.joined);
         self.joined += 1;
         self.nodes.insert(id, VecDeque::new());
@@ -83,26 +80,23 @@ impl Wire {
     }
 
     /// Removes a node and drops its waiting frames. Its frame in progress is still transmitted.
-    pub fn leave(&mut self, node: NodeId) {
+    pub(crate) fn leave(&mut self, node: NodeId) {
         self.nodes.remove(&node);
     }
 
     /// Number of the node's frames that have not been transmitted, including the one in progress.
-    pub fn waiting(&self, node: NodeId) -> usize {
+    pub(crate) fn waiting(&self, node: NodeId) -> usize {
         let queued = self.nodes.get(&node).map_or(0, VecDeque::len);
         queued + usize::from(self.in_progress.is_some_and(|frame| frame.from == node))
     }
 
     /// Whether the node's next frame would be refused.
-    pub fn is_full(&self, node: NodeId) -> bool {
+    pub(crate) fn is_full(&self, node: NodeId) -> bool {
         self.nodes.get(&node).is_none_or(|queue| queue.len() >= MAX_QUEUED)
     }
 
     /// Queues a frame. Call [`Wire::poll`] after it.
-    ///
-    /// # Errors
-    /// See [`Full`].
-    pub fn send(&mut self, now: Instant, node: NodeId, frame: CanFrame) -> Result<(), Full> {
+    pub(crate) fn send(&mut self, now: Instant, node: NodeId, frame: CanFrame) -> Result<(), Full> {
         let queue = self.nodes.get_mut(&node).filter(|queue| queue.len() < MAX_QUEUED).ok_or(Full)?;
         queue.push_back(QueuedFrame { since: now, frame });
         match self.in_progress {
@@ -121,13 +115,13 @@ impl Wire {
     }
 
     /// The end of the frame in progress, or [`Instant::NEVER`].
-    pub fn deadline(&self) -> Instant {
+    pub(crate) fn deadline(&self) -> Instant {
         self.in_progress.map_or(Instant::NEVER, |frame| frame.end)
     }
 
     /// The next frame that has ended by now. A late call changes nothing: the following frame began at this
     /// one's end, with arbitration among the nodes that had one queued by then.
-    pub fn poll(&mut self, now: Instant) -> Option<Transmitted> {
+    pub(crate) fn poll(&mut self, now: Instant) -> Option<Transmitted> {
         let InProgress { from, what, end, .. } = self.in_progress.take_if(|frame| frame.end <= now)?;
         self.free_since = end;
         self.arbitrate();
@@ -165,7 +159,7 @@ impl Wire {
 
 /// A frame's arbitration field as a number: the lowest wins. A standard frame wins over an extended one with
 /// the same leading 11 bits, and a data frame over a remote one.
-pub fn arbitration_field(frame: &CanFrame) -> u32 {
+pub(crate) fn arbitration_field(frame: &CanFrame) -> u32 {
     let remote = u32::from(frame.is_remote());
     match frame.id() {
         CanId::Standard(id) => u32::from(id) << 21 | remote << 20,
@@ -174,7 +168,7 @@ pub fn arbitration_field(frame: &CanFrame) -> u32 {
 }
 
 /// Length of a frame in bits, with stuff bits and the three bits of intermission.
-pub fn frame_bits(frame: &CanFrame) -> u32 {
+pub(crate) fn frame_bits(frame: &CanFrame) -> u32 {
     let mut bits = BitCounter::default();
     let field = arbitration_field(frame);
     bits.push(0, 1);
@@ -226,7 +220,7 @@ fn bits_time(bits: u32, bitrate: u32) -> Duration {
 }
 
 /// Maximum number of one node's frames that wait for the bus.
-pub const MAX_QUEUED: usize = 64;
+pub(crate) const MAX_QUEUED: usize = 64;
 /// CRC delimiter, acknowledgement with its delimiter, 7 bits of end of frame, 3 bits of intermission.
 const BITS_AFTER_CRC: u32 = 13;
 /// CRC-15/CAN.

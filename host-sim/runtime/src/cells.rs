@@ -75,7 +75,6 @@ fn start(cell: Cell, place: RuntimePlace) -> Result<Box<dyn ForegroundRun>, RunE
     Ok(Box::new(handle))
 }
 
-/// The gateways of all cells, by their names.
 struct Cells {
     ready: Value,
     cells: Vec<(String, Box<dyn ForegroundRun>)>,

@@ -27,13 +27,11 @@ impl RuntimeClient {
         Some(stats)
     }
 
-    /// Waits until it answers; false if it has ended.
     pub(crate) async fn answers(&self) -> bool {
         let (answer, answered) = oneshot::channel();
         self.requests.send(RuntimeRequest::Ping(answer)).is_ok() && answered.await.is_ok()
     }
 
-    /// A client and the receiver of its requests.
     #[cfg(test)]
     pub(super) fn channel() -> (Self, mpsc::UnboundedReceiver<RuntimeRequest>) {
         let (requests, inbox) = mpsc::unbounded_channel();

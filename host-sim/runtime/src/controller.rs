@@ -59,13 +59,10 @@ pub struct ControllerOptions {
 }
 
 /// Runs the simulated controller until Ctrl-C, SIGTERM or SIGHUP, or until it is shut down over port 2000.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), RunError> {
     let run = options.run.clone();
     let bound = run.console.as_ref().map(ConsoleOptions::bind).transpose()?;
-    let handle = spawn(config, options)?;
+    let handle = start_with(config, options)?;
     match bound {
         Some(bound) => host::foreground(Box::new(Consoled::start(bound, handle, run.log.clone())?), &run),
         None => host::foreground(Box::new(handle), &run),
@@ -74,9 +71,6 @@ pub fn run(config: SimConfig, options: ControllerOptions) -> Result<(), RunError
 
 /// Starts a simulated controller on a thread of its own and returns when everything is listening. Dropping
 /// the handle ends it.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
     start_with(
         config,
@@ -85,14 +79,7 @@ pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
 }
 
 /// Same, with options. Those for a run in the foreground have no effect.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunError> {
-    spawn(config, options)
-}
-
-fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunError> {
     host::start(&RuntimePlace::alone(), "controller", async move |_| {
         let scheduling = match options.pace {
             // It would look for input with priority over the clients that it waits for.
@@ -107,7 +94,6 @@ fn spawn(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunErr
     })
 }
 
-/// A controller whose tasks have been created.
 struct RunningController {
     runtime: Rc<ControllerRuntime>,
     tasks: JoinSet<()>,
@@ -163,13 +149,11 @@ struct ControllerRuntime {
     kernel_can: Vec<usize>,
     /// Since when frames wait at CAN interfaces of the kernel, by the port's number.
     kernel_sends: RefCell<BTreeMap<usize, Instant>>,
-    /// Number of events so far.
     activity: Cell<u64>,
     timeline: RefCell<Option<Timeline>>,
     timeline_alarm: Alarm,
     /// A step of the timeline is being executed.
     is_playing: Cell<bool>,
-    /// Number of the newest event that was reported.
     reported: Cell<u64>,
     events_file: Option<EventsWriter>,
     control_clients: RefCell<Vec<Rc<ControlClient>>>,

@@ -102,7 +102,6 @@ pub(super) struct EventsWriter {
 }
 
 impl EventsWriter {
-    /// Writes a line.
     pub(super) fn write(&self, line: &str) {
         let Some(lines) = &self.lines else { return };
         let text = match self.lost.get() {

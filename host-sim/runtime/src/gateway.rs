@@ -47,13 +47,10 @@ use tapping::Tapping;
 /// Observers of a gateway.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Observers {
-    /// Captures and recordings.
     pub watch: Watch,
     /// Decodes frames for them.
     pub decoder: Arc<Decoder>,
-    /// The console.
     pub slot: Option<Arc<SnapshotSlot>>,
-    /// The edge node.
     pub snapshot_watch: Option<SnapshotWatch>,
     /// Whether the log or the statistics are read, which report findings.
     pub readers: bool,
@@ -79,7 +76,6 @@ struct PreparedGateway {
     links: Vec<(LinkId, LinkKind, LinkEndpoint)>,
     ready: Value,
     slot: Option<Arc<SnapshotSlot>>,
-    /// The edge node's.
     publisher_slot: Option<Arc<SnapshotSlot>>,
     /// Examines the gateway once a second.
     doctor: Option<Doctor>,
@@ -88,7 +84,6 @@ struct PreparedGateway {
 /// Which outputs of the engine are executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum TxPolicy {
-    /// All of them.
     All,
     /// None that send, neither to the controller nor to the field.
     None,
@@ -111,7 +106,6 @@ struct Core {
     /// The gateway is being replaced: input of its devices is ignored.
     is_ending: Cell<bool>,
     tx_policy: TxPolicy,
-    /// Ports with exchanges.
     exchange_ports: BTreeSet<PortId>,
     started: Instant,
     /// Recent input of each port.
@@ -319,7 +313,6 @@ impl Core {
         }
     }
 
-    /// Reports one input and executes all outputs.
     fn input(&self, input: Input<'_>) {
         let at = now();
         trace!(input = %TraceText(&input), "in");
@@ -452,9 +445,6 @@ fn lift(outer: &mut Value, key: &str) {
 
 /// Runs the gateway until Ctrl-C, SIGTERM or SIGHUP. All records for [`RunOptions::watch`] are delivered when this
 /// returns.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), RunError> {
     let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
@@ -465,17 +455,11 @@ pub fn run(config: GatewayConfig, options: RunOptions) -> Result<(), RunError> {
 }
 
 /// Starts the gateway on a thread of its own; dropping the handle ends it.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn start(config: GatewayConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
     start_watched(config, binds, &Watch::new())
 }
 
 /// As [`start`], with records for the subscribers of `watch`, which can be reused for the next gateway.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn start_watched(config: GatewayConfig, binds: Vec<Bind>, watch: &Watch) -> Result<Handle, RunError> {
     let observers = Observers { watch: watch.clone(), ..Observers::default() };
     spawn(config, binds, Scheduling::Ordinary, observers, Handover::default(), &RuntimePlace::alone())
@@ -499,7 +483,7 @@ pub(crate) fn spawn(
         false => (None, None),
     };
     let publisher_slot = observers.snapshot_watch.as_ref().map(|watch| watch.open(&config));
-    let handle = host::start(place, "gateway", async move |at_end| {
+    let mut handle = host::start(place, "gateway", async move |at_end| {
         let devices = Devices { binds: &binds, handover: Some((handover, at_end)) };
         let mut gateway = PreparedGateway::open(&config, devices, TxPolicy::All, &observers).await?;
         gateway.slot = observers.slot;
@@ -513,7 +497,8 @@ pub(crate) fn spawn(
         info!(%scheduling, "the gateway is running");
         Ok(gateway)
     })?;
-    Ok(handle.with_watch(watch).with_findings(texts))
+    (handle.watch, handle.findings) = (watch, texts);
+    Ok(handle)
 }
 
 /// Interval at which safe values are checked for.

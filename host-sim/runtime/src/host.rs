@@ -40,8 +40,9 @@ pub(super) trait Runtime: 'static {
 pub struct Handle {
     ready: Value,
     requests: mpsc::UnboundedSender<RuntimeRequest>,
-    watch: Watch,
-    findings: Option<FindingTexts>,
+    pub(super) watch: Watch,
+    /// Added to the statistics.
+    pub(super) findings: Option<FindingTexts>,
     home: Option<Home>,
 }
 
@@ -62,7 +63,6 @@ pub(crate) trait ForegroundRun {
     fn stats(&self) -> Option<Value>;
     /// Clients of all threads that move data; empty if one of them does not run at the moment.
     fn clients(&self) -> Vec<RuntimeClient>;
-    /// Whether it has ended by itself.
     fn has_ended(&self) -> bool;
     /// Ends it and waits until it has ended. If it had ended by itself, returns the reason as the error.
     fn shutdown(self: Box<Self>) -> Result<(), RunError>;
@@ -134,7 +134,6 @@ fn alone<S: Runtime>(name: &str, opening: Opening<S>) -> Result<JoinHandle<Resul
     thread.map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
 }
 
-/// A runtime to be opened.
 struct Opening<S> {
     open: Open<S>,
     opened: blocking::Sender<Result<Value, RunError>>,
@@ -217,20 +216,6 @@ impl Handle {
     /// Frames and calls of the gateway, for any number of subscribers; a controller has none.
     pub fn watch(&self) -> &Watch {
         &self.watch
-    }
-
-    pub(super) fn with_watch(self, watch: Watch) -> Self {
-        // No struct update syntax: `Handle` implements `Drop`.
-        let mut handle = self;
-        handle.watch = watch;
-        handle
-    }
-
-    /// Adds the findings to the statistics.
-    pub(super) fn with_findings(self, findings: Option<FindingTexts>) -> Self {
-        let mut handle = self;
-        handle.findings = findings;
-        handle
     }
 
     /// Whether the runtime has ended by itself.

@@ -41,7 +41,6 @@ pub(super) enum LinkEndpoint {
     UdpListen { socket: UdpSocket, controller: String },
 }
 
-/// An event of a link.
 #[derive(Debug)]
 pub(super) enum LinkEvent<'a> {
     Up,
@@ -212,7 +211,6 @@ impl Drop for Lent<'_> {
     }
 }
 
-/// The context of a link's task.
 struct LinkTask<'a> {
     name: &'a str,
     control: &'a LinkControl,

@@ -99,7 +99,6 @@ impl LogLines {
         self.changed.notify_all();
     }
 
-    /// Waits for lines and takes them.
     fn take(&self) -> Vec<u8> {
         let none = |waiting: &mut WaitingLines| waiting.bytes.is_empty();
         let waited = self.changed.wait_while(locked(&self.waiting), none);
@@ -109,7 +108,6 @@ impl LogLines {
     }
 }
 
-/// The newest lines.
 #[derive(Debug, Clone, Default)]
 struct Newest {
     lines: VecDeque<String>,

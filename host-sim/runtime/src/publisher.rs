@@ -85,7 +85,6 @@ impl Publisher {
         })
     }
 
-    /// Where gateways register their snapshot slots.
     pub(crate) fn snapshot_watch(&self) -> SnapshotWatch {
         self.snapshot_watch.clone()
     }

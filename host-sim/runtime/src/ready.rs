@@ -134,7 +134,6 @@ fn is_cell(ready: &Value) -> bool {
 }
 
 const FOLDER: &str = "a folder; give the name of a file in it";
-/// Maximum length of a ready file.
 const MAX_BYTES: u64 = 1 << 16;
 
 #[cfg(test)]

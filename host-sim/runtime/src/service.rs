@@ -23,12 +23,10 @@ impl Service {
         Self { patience: sd_notify::watchdog_enabled() }
     }
 
-    /// Everything is listening.
     pub(super) fn is_ready(&self) {
         tell(&[NotifyState::Ready, NotifyState::Status("running")]);
     }
 
-    /// The run ends.
     pub(super) fn is_stopping(&self) {
         tell(&[NotifyState::Stopping, NotifyState::Status("ending")]);
     }

@@ -32,7 +32,6 @@ pub(crate) struct SnapshotSlot {
     pub(crate) safe: Mutex<Option<std::sync::mpsc::Sender<()>>>,
 }
 
-/// A gateway at one instant.
 #[derive(Debug, Clone)]
 pub(crate) struct GatewaySnapshot {
     /// A copy of the engine, only for reading.
@@ -45,7 +44,6 @@ pub(crate) struct GatewaySnapshot {
     ports: usize,
     /// Facts about the links that the engine does not know.
     pub(crate) links: Vec<LinkFacts>,
-    /// How long the gateway has been running.
     pub(crate) running: Duration,
 }
 
@@ -85,7 +83,6 @@ impl GatewaySnapshot {
 }
 
 impl SnapshotSlot {
-    /// An empty slot.
     pub(crate) fn new() -> Self {
         Self {
             snapshot: Mutex::new(None),
@@ -153,7 +150,6 @@ impl SnapshotSlot {
     }
 }
 
-/// How long a reader waits for a snapshot.
 const MAX_WAIT: StdDuration = StdDuration::from_millis(500);
 /// Time for safe values to arrive: as long as they are repeated where nothing shows them
 /// (proto-core/docs/engine.md section 6).

@@ -16,7 +16,6 @@ use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use recipe_io::fairness::yield_fairly;
 use recipe_io::timer::now;
 
-/// The sending side of a connection.
 #[derive(Debug)]
 pub(super) struct Connection {
     write: OwnedWriteHalf,
@@ -30,11 +29,9 @@ pub(super) struct Connection {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ConnectionEnd {
-    /// Open.
     Open,
     /// Close when everything was sent.
     Flush,
-    /// Close now.
     Abort,
 }
 
@@ -45,11 +42,9 @@ pub(super) enum Accepted {
     All,
     /// Some wait; [`ConnectionEvent::Drained`] reports when they were sent.
     Later,
-    /// The connection has failed, or too many bytes wait.
     Failed,
 }
 
-/// An event of a connection.
 #[derive(Debug)]
 pub(super) enum ConnectionEvent<'a> {
     /// Bytes arrived.
@@ -117,7 +112,6 @@ impl Connection {
         }
     }
 
-    /// Closes at once.
     pub(super) fn abort(&self) {
         self.end.set(ConnectionEnd::Abort);
         self.wake();
@@ -128,7 +122,6 @@ impl Connection {
         !self.out.borrow().is_empty()
     }
 
-    /// Whether it was closed by this side.
     pub(super) fn is_closed(&self) -> bool {
         self.end.get() != ConnectionEnd::Open
     }

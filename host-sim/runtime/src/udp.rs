@@ -9,9 +9,6 @@ use tokio::net::UdpSocket;
 
 /// Enables reports of ICMP errors on an unconnected socket (D24): after one, the next call on the socket
 /// fails, and [`unreachable_peers`] returns the peers.
-///
-/// # Errors
-/// If the system refuses the option.
 pub(super) fn keep_errors(socket: &UdpSocket) -> io::Result<()> {
     let on: libc::c_int = 1;
     let (level, name) = match socket.local_addr()? {

@@ -22,7 +22,6 @@ pub(super) fn panicked() -> RunError {
     RunError::new("a thread panicked").after_start()
 }
 
-/// The runtime of a thread.
 pub(super) fn runtime() -> Result<tokio::runtime::Runtime, RunError> {
     tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(no_runtime)
 }
@@ -34,7 +33,6 @@ pub(super) fn no_runtime(error: io::Error) -> RunError {
 /// Where a runtime runs.
 #[derive(Debug, Clone)]
 pub(crate) struct RuntimePlace {
-    /// The span of its log lines.
     pub(crate) span: Span,
     shared: Option<(Arc<Worker>, Begin)>,
 }
@@ -98,7 +96,6 @@ pub(crate) struct Worker {
 }
 
 impl Worker {
-    /// Starts a thread.
     pub(crate) fn start(name: &str) -> Result<Arc<Self>, RunError> {
         let (jobs, mut inbox) = mpsc::unbounded_channel::<Job>();
         // Built here, where an error can be returned.
@@ -114,7 +111,6 @@ impl Worker {
         Ok(Arc::new(Self { jobs: Some(jobs), thread: Some(thread) }))
     }
 
-    /// Runs a runtime on it.
     pub(super) fn run<F>(
         self: Arc<Self>,
         span: Span,
@@ -152,7 +148,6 @@ impl Drop for Worker {
     }
 }
 
-/// A runtime on a worker.
 #[derive(Debug)]
 pub(super) struct SharedRuntime {
     end: Arc<RuntimeEnd>,
@@ -165,7 +160,6 @@ impl SharedRuntime {
         self.end.result().is_some()
     }
 
-    /// Waits for its end.
     pub(super) fn ended(self) -> Result<(), RunError> {
         let result = self.end.result();
         let mut result = self
@@ -177,7 +171,6 @@ impl SharedRuntime {
     }
 }
 
-/// The result of a runtime, once it has ended.
 #[derive(Debug, Default)]
 struct RuntimeEnd {
     result: Mutex<Option<Result<(), RunError>>>,

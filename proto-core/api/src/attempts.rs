@@ -24,7 +24,6 @@ pub struct Attempts {
 #[derive(Debug, Clone)]
 struct Address {
     at: IpAddr,
-    /// The oldest first.
     wrong: Vec<Instant, MAX_WRONG>,
 }
 

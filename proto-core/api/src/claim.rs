@@ -52,9 +52,6 @@ impl Claim {
     }
 
     /// Somebody offers a key. If it is taken, the driver writes it and then calls [`Claim::written`].
-    ///
-    /// # Errors
-    /// Why it is not taken.
     pub fn offered(&mut self, now: Instant) -> Result<(), ClaimError> {
         self.poll(now);
         match *self {

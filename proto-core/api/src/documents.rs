@@ -157,9 +157,6 @@ impl Pieces {
     }
 
     /// Writes all pieces of one instant.
-    ///
-    /// # Errors
-    /// If `out` has no room.
     pub fn write_all(mut self, status: Status<'_>, out: &mut impl Write) -> Result<(), JsonError> {
         while self.write_next(status, out)? {}
         Ok(())
@@ -198,7 +195,6 @@ fn place(var: SysVar, bit: Option<u8>) -> usize {
     }
 }
 
-/// Number of places.
 const PLACES: usize = COUNT * 9;
 
 fn entry(

@@ -5,9 +5,9 @@ use core::fmt;
 use serde::ser::{self, Impossible, Serialize, Serializer};
 
 /// Calls `found` with each field that is an unsigned number.
-pub(crate) fn each(counters: &impl Serialize, found: impl FnMut(&'static str, u64)) {
+pub(crate) fn each(counters: &impl Serialize, mut found: impl FnMut(&'static str, u64)) {
     // What has no such fields has none to report.
-    let _ = counters.serialize(FieldVisitor(found));
+    let _ = counters.serialize(FieldVisitor { field: None, found: &mut found });
 }
 
 #[derive(Debug)]
@@ -27,9 +27,13 @@ impl ser::Error for NoFields {
     }
 }
 
-struct FieldVisitor<F>(F);
+struct FieldVisitor<'f, F> {
+    /// `None` for the struct itself.
+    field: Option<&'static str>,
+    found: &'f mut F,
+}
 
-impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for FieldVisitor<F> {
+impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for FieldVisitor<'_, F> {
     type Ok = ();
     type Error = NoFields;
 
@@ -38,9 +42,8 @@ impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for FieldVisitor<F> {
         key: &'static str,
         value: &T,
     ) -> Result<(), NoFields> {
-        if let Ok(value) = value.serialize(UnsignedSerializer) {
-            (self.0)(key, value);
-        }
+        // Fields that are no unsigned numbers are left out.
+        let _ = value.serialize(FieldVisitor { field: Some(key), found: &mut *self.found });
         Ok(())
     }
 
@@ -49,8 +52,13 @@ impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for FieldVisitor<F> {
     }
 }
 
-/// Takes unsigned numbers alone.
-struct UnsignedSerializer;
+macro_rules! numbers {
+    ($($method:ident($type:ty)),*) => {
+        $(fn $method(self, value: $type) -> Result<(), NoFields> {
+            self.serialize_u64(value.into())
+        })*
+    };
+}
 
 macro_rules! refused {
     ($ok:ty: $($method:ident($($arg:ty),*)),* $(,)?) => {
@@ -60,95 +68,60 @@ macro_rules! refused {
     };
 }
 
-macro_rules! serializer {
-    ($type:ty, $ok:ty, $struct:ty, { $($own:item)* }) => {
-        type Ok = $ok;
-        type Error = NoFields;
-        type SerializeSeq = Impossible<$ok, NoFields>;
-        type SerializeTuple = Impossible<$ok, NoFields>;
-        type SerializeTupleStruct = Impossible<$ok, NoFields>;
-        type SerializeTupleVariant = Impossible<$ok, NoFields>;
-        type SerializeMap = Impossible<$ok, NoFields>;
-        type SerializeStruct = $struct;
-        type SerializeStructVariant = Impossible<$ok, NoFields>;
+type Never = Impossible<(), NoFields>;
 
-        $($own)*
+impl<F: FnMut(&'static str, u64)> Serializer for FieldVisitor<'_, F> {
+    type Ok = ();
+    type Error = NoFields;
+    type SerializeSeq = Never;
+    type SerializeTuple = Never;
+    type SerializeTupleStruct = Never;
+    type SerializeTupleVariant = Never;
+    type SerializeMap = Never;
+    type SerializeStruct = Self;
+    type SerializeStructVariant = Never;
 
-        refused!($ok: serialize_bool(bool), serialize_i8(i8), serialize_i16(i16), serialize_i32(i32), serialize_i64(i64),
-            serialize_f32(f32), serialize_f64(f64), serialize_char(char), serialize_str(&str), serialize_bytes(&[u8]),
-            serialize_none(), serialize_unit(), serialize_unit_struct(&'static str),
-            serialize_unit_variant(&'static str, u32, &'static str));
-        refused!(Impossible<$ok, NoFields>: serialize_seq(Option<usize>), serialize_tuple(usize),
-            serialize_tuple_struct(&'static str, usize), serialize_map(Option<usize>),
-            serialize_tuple_variant(&'static str, u32, &'static str, usize),
-            serialize_struct_variant(&'static str, u32, &'static str, usize));
+    numbers!(serialize_u8(u8), serialize_u16(u16), serialize_u32(u32));
 
-        fn serialize_some<T: Serialize + ?Sized>(self, _: &T) -> Result<$ok, NoFields> {
-            Err(NoFields)
-        }
+    fn serialize_u64(self, value: u64) -> Result<(), NoFields> {
+        (self.found)(self.field.ok_or(NoFields)?, value);
+        Ok(())
+    }
 
-        fn serialize_newtype_struct<T: Serialize + ?Sized>(self, _: &'static str, _: &T) -> Result<$ok, NoFields> {
-            Err(NoFields)
-        }
+    fn serialize_struct(self, _: &'static str, _: usize) -> Result<Self, NoFields> {
+        if self.field.is_none() { Ok(self) } else { Err(NoFields) }
+    }
 
-        fn serialize_newtype_variant<T: Serialize + ?Sized>(
-            self, _: &'static str, _: u32, _: &'static str, _: &T,
-        ) -> Result<$ok, NoFields> {
-            Err(NoFields)
-        }
+    refused!((): serialize_bool(bool), serialize_i8(i8), serialize_i16(i16), serialize_i32(i32), serialize_i64(i64),
+        serialize_f32(f32), serialize_f64(f64), serialize_char(char), serialize_str(&str), serialize_bytes(&[u8]),
+        serialize_none(), serialize_unit(), serialize_unit_struct(&'static str),
+        serialize_unit_variant(&'static str, u32, &'static str));
+    refused!(Never: serialize_seq(Option<usize>), serialize_tuple(usize),
+        serialize_tuple_struct(&'static str, usize), serialize_map(Option<usize>),
+        serialize_tuple_variant(&'static str, u32, &'static str, usize),
+        serialize_struct_variant(&'static str, u32, &'static str, usize));
 
-        fn collect_str<T: fmt::Display + ?Sized>(self, _: &T) -> Result<$ok, NoFields> {
-            Err(NoFields)
-        }
-    };
-}
+    fn serialize_some<T: Serialize + ?Sized>(self, _: &T) -> Result<(), NoFields> {
+        Err(NoFields)
+    }
 
-impl Serializer for UnsignedSerializer {
-    serializer!(UnsignedSerializer, u64, Impossible<u64, NoFields>, {
-        fn serialize_u8(self, value: u8) -> Result<u64, NoFields> {
-            Ok(value.into())
-        }
+    fn serialize_newtype_struct<T: Serialize + ?Sized>(self, _: &'static str, _: &T) -> Result<(), NoFields> {
+        Err(NoFields)
+    }
 
-        fn serialize_u16(self, value: u16) -> Result<u64, NoFields> {
-            Ok(value.into())
-        }
+    fn serialize_newtype_variant<T: Serialize + ?Sized>(
+        self,
+        _: &'static str,
+        _: u32,
+        _: &'static str,
+        _: &T,
+    ) -> Result<(), NoFields> {
+        Err(NoFields)
+    }
 
-        fn serialize_u32(self, value: u32) -> Result<u64, NoFields> {
-            Ok(value.into())
-        }
-
-        fn serialize_u64(self, value: u64) -> Result<u64, NoFields> {
-            Ok(value)
-        }
-
-        fn serialize_struct(self, _: &'static str, _: usize) -> Result<Impossible<u64, NoFields>, NoFields> {
-            Err(NoFields)
-        }
-    });
-}
-
-impl<F: FnMut(&'static str, u64)> Serializer for FieldVisitor<F> {
-    serializer!(FieldVisitor<F>, (), Self, {
-        fn serialize_u8(self, _: u8) -> Result<(), NoFields> {
-            Err(NoFields)
-        }
-
-        fn serialize_u16(self, _: u16) -> Result<(), NoFields> {
-            Err(NoFields)
-        }
-
-        fn serialize_u32(self, _: u32) -> Result<(), NoFields> {
-            Err(NoFields)
-        }
-
-        fn serialize_u64(self, _: u64) -> Result<(), NoFields> {
-            Err(NoFields)
-        }
-
-        fn serialize_struct(self, _: &'static str, _: usize) -> Result<Self, NoFields> {
-            Ok(self)
-        }
-    });
+    fn collect_str<T: fmt::Display + ?Sized>(self, _: &T) -> Result<(), NoFields> {
+        Err(NoFields)
+    }
 }
 
 #[cfg(test)]

@@ -156,13 +156,13 @@ impl From<HeadError> for Refusal {
 impl Guard {
     /// A guard with this key; without one nothing can be changed, and nothing is told over a network.
     /// `secret` is random, and another after each start.
-    pub const fn new(key: Option<Key>, secret: Hash) -> Self {
+    pub fn new(key: Option<Key>, secret: Hash) -> Self {
         Self {
             key,
             secret,
             nonces: Nonces::new(secret),
             attempts: Attempts::new(),
-            counters: RequestCounters::NONE,
+            counters: RequestCounters::default(),
         }
     }
 
@@ -187,9 +187,6 @@ impl Guard {
     }
 
     /// Decides about a request.
-    ///
-    /// # Errors
-    /// Why it is refused.
     pub fn admit(
         &mut self,
         now: Instant,
@@ -363,20 +360,6 @@ impl Guard {
     }
 }
 
-impl RequestCounters {
-    const NONE: Self = Self {
-        admitted: 0,
-        unfit: 0,
-        wrong_host: 0,
-        cross_site: 0,
-        without_key: 0,
-        wrong_key: 0,
-        replayed: 0,
-        locked_out: 0,
-    };
-}
-
-/// Which counter a refusal belongs to.
 #[derive(Debug, Clone, Copy)]
 enum Why {
     Unfit,

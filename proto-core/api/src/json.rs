@@ -50,9 +50,6 @@ pub fn write(out: &mut impl Write, value: &(impl Serialize + ?Sized)) -> Result<
 }
 
 /// Writes a text in quotes.
-///
-/// # Errors
-/// Those of `out`.
 pub fn write_text(out: &mut impl Write, text: impl fmt::Display) -> fmt::Result {
     out.write_char('"')?;
     write!(Escaped(out), "{text}")?;

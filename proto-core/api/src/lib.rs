@@ -75,7 +75,7 @@ pub mod json;
 pub mod key;
 pub mod metrics;
 pub mod nonces;
-pub mod number;
+mod number;
 pub mod request;
 pub mod response;
 pub mod revisions;

@@ -148,9 +148,6 @@ impl Families {
     }
 
     /// Writes everything.
-    ///
-    /// # Errors
-    /// Those of `out`.
     pub fn write_all(mut self, status: Status<'_>, out: &mut impl Write) -> fmt::Result {
         while self.write_next(status, out)? {}
         Ok(())

@@ -72,9 +72,6 @@ impl Nonces {
     }
 
     /// Whether a nonce may be used; it is not used by that.
-    ///
-    /// # Errors
-    /// Why it does not count.
     pub fn check(&self, now: Instant, text: &str) -> Result<Fresh, NonceError> {
         let bytes: [u8; LEN] = key::from_hex(text).ok_or(NonceError::Unknown)?;
         let (time, rest) = bytes.split_first_chunk::<8>().ok_or(NonceError::Unknown)?;

@@ -10,7 +10,7 @@ use heapless::String;
 
 /// A whole number without a sign.
 #[derive(Debug, Clone, Copy)]
-pub struct Whole(pub u64);
+pub(crate) struct Whole(pub(crate) u64);
 
 impl fmt::Display for Whole {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -21,7 +21,7 @@ impl fmt::Display for Whole {
 
 /// A whole number with a sign.
 #[derive(Debug, Clone, Copy)]
-pub struct Signed(pub i64);
+pub(crate) struct Signed(pub(crate) i64);
 
 impl fmt::Display for Signed {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -54,7 +54,7 @@ fn digits(number: u64, room: &mut [u8; 20]) -> Option<&str> {
 /// A number of 32 bits as the shortest text that is read as the same number, as `{:?}` writes it: with a point or
 /// an exponent. What is not finite has no such text.
 #[derive(Debug, Clone, Copy)]
-pub struct Shortest(pub f32);
+pub(crate) struct Shortest(pub(crate) f32);
 
 impl fmt::Display for Shortest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -174,9 +174,6 @@ impl<'a> Response<'a> {
     }
 
     /// Writes the head, up to and with its empty line.
-    ///
-    /// # Errors
-    /// Those of `out`, if it has no room.
     pub fn write(&self, out: &mut impl Write) -> fmt::Result {
         write!(out, "HTTP/1.1 {} {}\r\n", self.status.0, self.status.reason())?;
         // What the client has already is not described again: its length is not that of this answer.
@@ -229,9 +226,6 @@ impl Page {
     }
 
     /// Writes the head of an answer with this status.
-    ///
-    /// # Errors
-    /// Those of `out`, if it has no room.
     pub fn write_head(&self, status: StatusCode, out: &mut impl Write) -> fmt::Result {
         let fields: [(&str, &dyn fmt::Display); 2] = [("ETag", &self.etag), ("Content-Encoding", &"gzip")];
         // Of a page that the client has, only which one it is.
@@ -250,9 +244,6 @@ const NOTHING: &str = "default-src 'none'; frame-ancestors 'none'";
 pub const CONTINUE: &str = "HTTP/1.1 100 Continue\r\n\r\n";
 
 /// Writes a piece of a chunked body. An empty one would end it and is left out.
-///
-/// # Errors
-/// Those of `out`, if it has no room.
 pub fn write_chunk(out: &mut impl Write, piece: &str) -> fmt::Result {
     match piece.len() {
         0 => Ok(()),

@@ -11,8 +11,14 @@
 //! The contract is that of the engine: change it, then call [`Revisions::poll_output`] until it returns
 //! [`RevisionOutput::Sleep`]. Each other output is carried out, and its result is reported, before the next call.
 
-use heapless::Vec;
+use core::fmt::{self, Write as _};
+
+use heapless::{String, Vec};
 use proto_core::time::{Duration, Instant};
+
+use crate::guard::Refusal;
+use crate::request::cut;
+use crate::response::StatusCode;
 
 /// Maximum number of revisions that are kept.
 pub const MAX_REVISIONS: usize = 8;
@@ -28,6 +34,46 @@ pub struct Revision {
     pub number: u32,
     /// The beginning of the hash of its contents: two stores may have the same numbers.
     pub digest: u32,
+}
+
+/// The ETag of a revision, such as `"3-0badcafe"` with its quotes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Etag(pub Revision);
+
+impl fmt::Display for Etag {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "\"{}-{:08x}\"", self.0.number, self.0.digest)
+    }
+}
+
+impl Etag {
+    /// The revision of an ETag; `None` if it is not exactly the text that is displayed.
+    pub fn parse(text: &str) -> Option<Revision> {
+        let (number, digest) = cut(text.strip_prefix('"')?.strip_suffix('"')?, b'-')?;
+        let revision =
+            Revision { number: number.parse().ok()?, digest: u32::from_str_radix(digest, 16).ok()? };
+        let mut same = String::<24>::new();
+        write!(same, "{}", Self(revision)).ok()?;
+        (same == text).then_some(revision)
+    }
+}
+
+/// The revision that a change is based on, from `If-Match`: `Some(None)` if that is not one ETag.
+///
+/// # Errors
+/// `If-Match` is missing, or is no ETag.
+pub fn base_of(if_match: Option<Option<Revision>>) -> core::result::Result<Revision, Refusal> {
+    match if_match {
+        Some(Some(base)) => Ok(base),
+        Some(None) => Err(Refusal::new(
+            StatusCode::PRECONDITION_FAILED,
+            "If-Match must be one ETag, such as \"3-0badcafe\"",
+        )),
+        None => Err(Refusal::new(
+            StatusCode::PRECONDITION_REQUIRED,
+            "If-Match is needed: the ETag of the revision that this one was made from",
+        )),
+    }
 }
 
 /// What a store holds at the start.
@@ -54,7 +100,6 @@ pub struct Revisions {
     is_due: bool,
 }
 
-/// What is being done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum RevisionPhase {
     /// The live one runs.
@@ -170,6 +215,41 @@ pub enum Refused {
     NoPrevious,
 }
 
+impl Refused {
+    /// The status of the response.
+    pub const fn status(self) -> StatusCode {
+        match self {
+            Self::Changed(_) => StatusCode::PRECONDITION_FAILED,
+            Self::Unknown => StatusCode::NOT_FOUND,
+            Self::Trial => StatusCode::BAD_REQUEST,
+            _ => StatusCode::CONFLICT,
+        }
+    }
+}
+
+/// The text of the response.
+impl fmt::Display for Refused {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let seconds = |at: &Duration| (at.as_millis() / 1_000) as u32;
+        f.write_str(match self {
+            Self::Busy => "something else is being done; try again",
+            Self::OnTrial => "a revision is on trial; confirm it or roll it back first",
+            Self::NotOnTrial => "no revision is on trial",
+            Self::Changed(base) => {
+                return write!(f, "the configuration was changed meanwhile; the newest is {}", Etag(*base));
+            }
+            Self::NothingWaits => "no stored revision waits; name one",
+            Self::Unknown => "there is no such revision",
+            Self::Runs => "it is live already",
+            Self::Trial => {
+                let (min, max) = (seconds(TRIAL.start()), seconds(TRIAL.end()));
+                return write!(f, "confirm_s is out of range; allowed: {min}..={max}");
+            }
+            Self::NoPrevious => "no other revision was live before",
+        })
+    }
+}
+
 impl Revisions {
     /// With what a store holds. The live one runs, or is about to be started by the driver; `None` if the
     /// store does not hold the live one.
@@ -269,9 +349,6 @@ impl Revisions {
 
     /// Somebody stores a configuration that was made from `base`. Returns its number; it is kept once the
     /// store has succeeded.
-    ///
-    /// # Errors
-    /// Why it is not stored.
     pub fn put(&mut self, base: Revision, digest: u32) -> core::result::Result<u32, Refused> {
         self.must_rest()?;
         match self.base() {
@@ -290,9 +367,6 @@ impl Revisions {
     }
 
     /// Somebody applies a revision, or the one that waits. Returns its number.
-    ///
-    /// # Errors
-    /// Why it is not applied.
     pub fn apply(&mut self, number: Option<u32>, trial: Duration) -> core::result::Result<u32, Refused> {
         self.must_rest()?;
         if !TRIAL.contains(&trial) {
@@ -313,9 +387,6 @@ impl Revisions {
     }
 
     /// Somebody confirms what runs on trial. Returns its number; it is live once it is marked.
-    ///
-    /// # Errors
-    /// Why it is not confirmed.
     pub fn confirm(&mut self, now: Instant) -> core::result::Result<u32, Refused> {
         match self.phase {
             RevisionPhase::Trial { number, until } if now < until => {
@@ -329,9 +400,6 @@ impl Revisions {
 
     /// Somebody takes back what runs on trial, or else what is live. Returns the number of the one that runs
     /// next.
-    ///
-    /// # Errors
-    /// Why it is not taken back.
     pub fn roll_back(&mut self) -> core::result::Result<u32, Refused> {
         match (self.phase, self.previous) {
             (RevisionPhase::Trial { number, .. }, _) => {

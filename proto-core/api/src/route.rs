@@ -167,68 +167,40 @@ pub struct Route {
 
 /// All endpoints.
 pub const ROUTES: &[Route] = &[
-    route("/", Method::Get, ApiOperation::Page, Access::Open, BodyType::None, ALL),
-    route("/api/v1/info", Method::Get, ApiOperation::Info, Access::Read, BodyType::None, ALL),
-    route("/api/v1/status", Method::Get, ApiOperation::Status, Access::Read, BodyType::None, ALL),
-    route("/api/v1/values", Method::Get, ApiOperation::Values, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/metrics", Method::Get, ApiOperation::Metrics, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/config", Method::Get, ApiOperation::Config, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/config", Method::Put, ApiOperation::PutConfig, Access::Write, BodyType::Toml, GATEWAY),
-    route("/api/v1/config", Method::Put, ApiOperation::PutConfig, Access::Write, BodyType::Image, BOARD),
-    route("/api/v1/revisions", Method::Get, ApiOperation::Revisions, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/stream", Method::Get, ApiOperation::Stream, Access::Read, BodyType::None, ALL),
-    route(
-        "/api/v1/capture.pcapng",
-        Method::Get,
-        ApiOperation::Capture,
-        Access::Read,
-        BodyType::None,
-        GATEWAY,
-    ),
-    route("/api/v1/schema", Method::Get, ApiOperation::Schema, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/export/dbc", Method::Get, ApiOperation::ExportDbc, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/export/lua", Method::Get, ApiOperation::ExportLua, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/export/md", Method::Get, ApiOperation::ExportMap, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/doctor", Method::Get, ApiOperation::Doctor, Access::Read, BodyType::None, GATEWAY),
-    route("/api/v1/log", Method::Get, ApiOperation::Log, Access::Read, BodyType::None, ALL),
-    route("/api/v1/bundle", Method::Get, ApiOperation::Bundle, Access::Read, BodyType::None, HOSTS),
-    route("/api/v1/nonce", Method::Get, ApiOperation::Nonce, Access::Open, BodyType::None, ALL),
-    route("/api/v1/check", Method::Post, ApiOperation::Check, Access::Read, BodyType::Toml, HOSTS),
-    route("/api/v1/apply", Method::Post, ApiOperation::Apply, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/confirm", Method::Post, ApiOperation::Confirm, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/rollback", Method::Post, ApiOperation::Rollback, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/identify", Method::Post, ApiOperation::Identify, Access::Write, BodyType::Json, GATEWAYS),
-    route("/api/v1/pendant", Method::Post, ApiOperation::Pendant, Access::Write, BodyType::Json, CONTROLLER),
-    route("/api/v1/update", Method::Get, ApiOperation::Update, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/update", Method::Put, ApiOperation::PutUpdate, Access::Write, BodyType::Image, GATEWAYS),
-    route(
-        "/api/v1/update/try",
-        Method::Post,
-        ApiOperation::TryUpdate,
-        Access::Write,
-        BodyType::Json,
-        GATEWAYS,
-    ),
-    route(
-        "/api/v1/update/confirm",
-        Method::Post,
-        ApiOperation::ConfirmUpdate,
-        Access::Write,
-        BodyType::Json,
-        GATEWAYS,
-    ),
-    route(
-        "/api/v1/update/back",
-        Method::Post,
-        ApiOperation::EndUpdate,
-        Access::Write,
-        BodyType::Json,
-        GATEWAYS,
-    ),
-    route("/api/v1/edge", Method::Get, ApiOperation::Edge, Access::Read, BodyType::None, GATEWAYS),
-    route("/api/v1/edge", Method::Put, ApiOperation::PutEdge, Access::Write, BodyType::Image, GATEWAYS),
+    Route { access: Access::Open, ..get("/", ApiOperation::Page, ALL) },
+    get("/api/v1/info", ApiOperation::Info, ALL),
+    get("/api/v1/status", ApiOperation::Status, ALL),
+    get("/api/v1/values", ApiOperation::Values, GATEWAYS),
+    get("/api/v1/metrics", ApiOperation::Metrics, GATEWAYS),
+    get("/api/v1/config", ApiOperation::Config, GATEWAYS),
+    put("/api/v1/config", ApiOperation::PutConfig, BodyType::Toml, GATEWAY),
+    put("/api/v1/config", ApiOperation::PutConfig, BodyType::Image, BOARD),
+    get("/api/v1/revisions", ApiOperation::Revisions, GATEWAYS),
+    get("/api/v1/stream", ApiOperation::Stream, ALL),
+    get("/api/v1/capture.pcapng", ApiOperation::Capture, GATEWAY),
+    get("/api/v1/schema", ApiOperation::Schema, GATEWAY),
+    get("/api/v1/export/dbc", ApiOperation::ExportDbc, GATEWAY),
+    get("/api/v1/export/lua", ApiOperation::ExportLua, GATEWAY),
+    get("/api/v1/export/md", ApiOperation::ExportMap, GATEWAY),
+    get("/api/v1/doctor", ApiOperation::Doctor, GATEWAY),
+    get("/api/v1/log", ApiOperation::Log, ALL),
+    get("/api/v1/bundle", ApiOperation::Bundle, HOSTS),
+    Route { access: Access::Open, ..get("/api/v1/nonce", ApiOperation::Nonce, ALL) },
+    Route { access: Access::Read, body: BodyType::Toml, ..post("/api/v1/check", ApiOperation::Check, HOSTS) },
+    post("/api/v1/apply", ApiOperation::Apply, GATEWAYS),
+    post("/api/v1/confirm", ApiOperation::Confirm, GATEWAYS),
+    post("/api/v1/rollback", ApiOperation::Rollback, GATEWAYS),
+    post("/api/v1/identify", ApiOperation::Identify, GATEWAYS),
+    post("/api/v1/pendant", ApiOperation::Pendant, CONTROLLER),
+    get("/api/v1/update", ApiOperation::Update, GATEWAYS),
+    put("/api/v1/update", ApiOperation::PutUpdate, BodyType::Image, GATEWAYS),
+    post("/api/v1/update/try", ApiOperation::TryUpdate, GATEWAYS),
+    post("/api/v1/update/confirm", ApiOperation::ConfirmUpdate, GATEWAYS),
+    post("/api/v1/update/back", ApiOperation::EndUpdate, GATEWAYS),
+    get("/api/v1/edge", ApiOperation::Edge, GATEWAYS),
+    put("/api/v1/edge", ApiOperation::PutEdge, BodyType::Image, GATEWAYS),
     // There is no key to be shown yet; the button stands for it.
-    route("/api/v1/claim", Method::Post, ApiOperation::Claim, Access::Open, BodyType::Json, BOARD),
+    Route { access: Access::Open, ..post("/api/v1/claim", ApiOperation::Claim, BOARD) },
 ];
 
 const ALL: &[Served] = &[Served::Gateway, Served::Controller, Served::Board];
@@ -238,15 +210,23 @@ const GATEWAY: &[Served] = &[Served::Gateway];
 const CONTROLLER: &[Served] = &[Served::Controller];
 const BOARD: &[Served] = &[Served::Board];
 
-const fn route(
+/// A read without a body.
+const fn get(path: &'static str, operation: ApiOperation, served: &'static [Served]) -> Route {
+    Route { path, method: Method::Get, operation, access: Access::Read, body: BodyType::None, served }
+}
+
+/// A change with arguments.
+const fn post(path: &'static str, operation: ApiOperation, served: &'static [Served]) -> Route {
+    Route { path, method: Method::Post, operation, access: Access::Write, body: BodyType::Json, served }
+}
+
+const fn put(
     path: &'static str,
-    method: Method,
     operation: ApiOperation,
-    access: Access,
     body: BodyType,
     served: &'static [Served],
 ) -> Route {
-    Route { path, method, operation, access, body, served }
+    Route { path, method: Method::Put, operation, access: Access::Write, body, served }
 }
 
 /// Why there is no route.
@@ -259,9 +239,6 @@ pub enum RouteError {
 }
 
 /// The route of a request.
-///
-/// # Errors
-/// If there is none.
 pub fn find(head: &HttpHead<'_>, served: Served) -> Result<&'static Route, RouteError> {
     let path = head.path();
     let here = || ROUTES.iter().filter(move |route| route.path == path && route.served.contains(&served));

@@ -4,10 +4,9 @@
 use proptest::prelude::*;
 use proto_core::time::{Duration, Instant};
 use recipe_api::revisions::{
-    Ended, MAX_REVISIONS, Refused, Result, Revision, RevisionOutput, Revisions, Stored,
+    Ended, Etag, MAX_REVISIONS, Refused, Result, Revision, RevisionOutput, Revisions, Stored,
 };
 
-/// What may happen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Event {
     Put,
@@ -313,4 +312,16 @@ fn a_store_without_its_live_revision_is_refused() {
     assert_eq!(machine.clone().apply(Some(3), TRIAL), Err(Refused::Runs));
     assert_eq!(machine.clone().apply(Some(4), Duration::from_secs(0)), Err(Refused::Trial));
     assert_eq!(machine.clone().confirm(Instant::ZERO), Err(Refused::NotOnTrial));
+}
+
+#[test]
+fn an_etag_has_one_text() {
+    let revision = Revision { number: 12, digest: 0xBAD_CAFE };
+    assert_eq!(Etag(revision).to_string(), "\"12-0badcafe\"");
+    assert_eq!(Etag::parse("\"12-0badcafe\""), Some(revision));
+    for wrong in
+        ["12-0badcafe", "\"12-badcafe\"", "\"12-0BADCAFE\"", "\"+12-0badcafe\"", "\"012-0badcafe\"", "*", ""]
+    {
+        assert_eq!(Etag::parse(wrong), None, "{wrong}");
+    }
 }

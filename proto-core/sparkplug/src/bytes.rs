@@ -2,7 +2,6 @@
 //!
 //! What does not fit is counted all the same, so one function both measures and writes.
 
-/// A buffer that is being written.
 #[derive(Debug)]
 pub(crate) struct ByteWriter<'b> {
     buf: &'b mut [u8],
@@ -22,7 +21,6 @@ impl<'b> ByteWriter<'b> {
         out.len
     }
 
-    /// Appends bytes.
     pub(crate) fn put(&mut self, bytes: &[u8]) {
         let room = self.buf.get_mut(self.len..).unwrap_or_default();
         for (to, from) in room.iter_mut().zip(bytes) {
@@ -31,7 +29,6 @@ impl<'b> ByteWriter<'b> {
         self.len = self.len.saturating_add(bytes.len());
     }
 
-    /// Appends one byte.
     pub(crate) fn byte(&mut self, byte: u8) {
         self.put(&[byte]);
     }

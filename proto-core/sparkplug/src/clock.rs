@@ -19,7 +19,6 @@ impl UtcClock {
         self.known.replace((at, utc_ms)).is_none()
     }
 
-    /// Whether UTC is known.
     pub(crate) const fn is_known(&self) -> bool {
         self.known.is_some()
     }

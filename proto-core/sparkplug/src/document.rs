@@ -177,9 +177,6 @@ impl NodeDocument {
     }
 
     /// Writes it into `buf`, which has [`MAX_DOCUMENT`] bytes, and returns what was written.
-    ///
-    /// # Errors
-    /// If a board would refuse it.
     pub fn encode<'b>(&self, buf: &'b mut [u8]) -> Result<&'b [u8], DocumentError> {
         let mut out = ByteWriter::new(buf);
         begin(&mut out, true);

@@ -10,11 +10,9 @@ pub(crate) struct Past {
     pub place: u16,
     /// It may have become unknown.
     pub value: StoredValue,
-    /// When.
     pub at: Stamp,
 }
 
-/// The ring.
 #[derive(Debug, Clone)]
 pub(crate) struct History<const ROOM: usize> {
     kept: Deque<Past, ROOM>,
@@ -31,7 +29,6 @@ impl<const ROOM: usize> History<ROOM> {
         self.lost
     }
 
-    /// Number of values in it.
     pub(crate) fn len(&self) -> usize {
         self.kept.len()
     }

@@ -32,7 +32,6 @@ pub(crate) fn text_of(out: &mut ByteWriter<'_>, write: impl Fn(&mut ByteWriter<'
     write(out);
 }
 
-/// The longest body that a packet may have.
 pub(crate) const MAX_BODY: usize = 268_435_455;
 
 /// Kinds of packets, with their flags.

@@ -5,7 +5,6 @@
 //! changes while there is no session is kept and told later, marked as historical.
 
 mod io;
-mod maybe;
 mod messages;
 mod poll;
 mod settings;
@@ -21,7 +20,6 @@ use crate::payload::{self, Asked, HostState};
 use crate::topic;
 use crate::value::{DataType, Stamp, StoredValue, Value};
 pub use io::{Input, NodeCounters, NodeError, NodeOutput, SessionFailure};
-use maybe::Maybe;
 pub use messages::MAX_METRIC;
 pub use settings::{Credential, MAX_TEXT, Settings};
 
@@ -50,7 +48,6 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     device_births: [Option<Instant>; MAX_DEVICES],
     phase: NodePhase,
     inbox: Inbox<MAX_PACKET>,
-    /// Publications to acknowledge.
     acks: Deque<u16, 8>,
     seq: u8,
     bd_seq: Option<u8>,
@@ -69,11 +66,9 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     counters: NodeCounters,
 }
 
-/// One metric.
 #[derive(Debug, Clone, Copy)]
 struct NodeMetric {
     data_type: DataType,
-    /// To be told.
     is_pending: bool,
     current: StoredValue,
     /// The last one told, and when it was sampled; never if none was.
@@ -120,7 +115,6 @@ struct Dates {
     is_utc: bool,
 }
 
-/// A birth on its way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Birth {
     owner: Owner,
@@ -509,7 +503,24 @@ impl NodeMetric {
     }
 }
 
-/// What a packet says.
+/// An option that is all zeros when there is nothing, whatever could be in it: so a node that is not made yet takes no
+/// flash.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+enum Maybe<T> {
+    Nothing,
+    Just(T),
+}
+
+impl<T: Copy> Maybe<T> {
+    const fn get(self) -> Option<T> {
+        match self {
+            Self::Nothing => None,
+            Self::Just(value) => Some(value),
+        }
+    }
+}
+
 enum PacketContent {
     Accepted(u8),
     Subscribed(bool),

@@ -17,12 +17,10 @@ pub(crate) struct Details<'a> {
     pub description: &'a str,
 }
 
-/// One metric of a payload.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PayloadMetric<'a> {
     /// Its name, in births.
     pub name: Option<&'a str>,
-    /// Its alias.
     pub alias: Option<u64>,
     /// When the value was taken: milliseconds.
     pub timestamp: u64,
@@ -36,12 +34,10 @@ pub(crate) struct PayloadMetric<'a> {
     pub details: Details<'a>,
 }
 
-/// The beginning of a payload.
 pub(crate) fn begin(out: &mut ByteWriter<'_>, timestamp: u64) {
     protobuf::number(out, 1, timestamp);
 }
 
-/// One metric.
 pub(crate) fn metric(out: &mut ByteWriter<'_>, shown: &PayloadMetric<'_>) {
     protobuf::message(out, 2, |out| body(out, shown));
 }
@@ -51,7 +47,6 @@ pub(crate) fn end(out: &mut ByteWriter<'_>, seq: u8) {
     protobuf::number(out, 3, seq.into());
 }
 
-/// The payload of NDEATH.
 pub(crate) fn death(out: &mut ByteWriter<'_>, timestamp: u64, bd_seq: u8) {
     begin(out, timestamp);
     metric(out, &bd_seq_metric(timestamp, bd_seq));
@@ -147,7 +142,6 @@ fn properties(out: &mut ByteWriter<'_>, details: &Details<'_>) {
 /// What a command asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct Asked {
-    /// New births.
     pub is_rebirth: bool,
     /// Number of other metrics, which nobody may write.
     pub others: u32,

@@ -25,13 +25,11 @@ pub(crate) fn number(out: &mut ByteWriter<'_>, field: u8, value: u64) {
     varint(out, value);
 }
 
-/// A field with a `float`.
 pub(crate) fn float(out: &mut ByteWriter<'_>, field: u8, value: f32) {
     key(out, field, FIXED32);
     out.put(&value.to_le_bytes());
 }
 
-/// A field with a `double`.
 pub(crate) fn double(out: &mut ByteWriter<'_>, field: u8, value: f64) {
     key(out, field, FIXED64);
     out.put(&value.to_le_bytes());
@@ -51,10 +49,8 @@ pub(crate) fn message(out: &mut ByteWriter<'_>, field: u8, write: impl Fn(&mut B
     write(out);
 }
 
-/// A value of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ProtobufField<'a> {
-    /// A whole number.
     Number(u64),
     /// Four or eight bytes.
     Fixed,

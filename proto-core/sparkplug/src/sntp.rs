@@ -14,7 +14,6 @@ pub const PACKET: usize = 48;
 /// A client of one server.
 #[derive(Debug, Clone, Copy)]
 pub struct Sntp {
-    /// When the next request is due.
     next: Instant,
     /// The request that was not answered: its time stamp, and when it left.
     asked: Option<([u8; 8], Instant)>,

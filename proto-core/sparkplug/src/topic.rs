@@ -31,9 +31,6 @@ pub enum IdError {
 
 impl Id {
     /// Checks a name.
-    ///
-    /// # Errors
-    /// If it cannot be part of a topic.
     pub fn new(name: &str) -> Result<Self, IdError> {
         check(name)?;
         String::try_from(name).map(Self).map_err(|_| IdError::Long { len: name.len() })
@@ -106,7 +103,6 @@ pub(crate) fn is_command(topic: &str, group: &Id, node: &Id) -> bool {
     rest.and_then(|rest| rest.strip_prefix("/NCMD/")) == Some(node.as_str())
 }
 
-/// Writes the topic of a host's state.
 pub(crate) fn write_state(out: &mut ByteWriter<'_>, host: &Id) {
     out.put(STATE.as_bytes());
     out.put(host.0.as_bytes());

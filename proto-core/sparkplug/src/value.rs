@@ -122,7 +122,6 @@ impl StoredValue {
         Self::Bits(halves(bits))
     }
 
-    /// The value, whose type is this one.
     pub(crate) fn get(self, data_type: DataType) -> Option<Value> {
         let halves = match self {
             Self::Unknown => return None,

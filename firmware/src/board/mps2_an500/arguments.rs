@@ -12,7 +12,6 @@ pub(crate) fn argument<T>(nth: usize, look: impl FnOnce(&str) -> T) -> Option<T>
     (&args).nth(nth).and_then(Result::ok).map(look)
 }
 
-/// The name of a file of the host.
 #[derive(Debug)]
 pub(crate) struct FileName([u8; MAX_ARGUMENTS + 1]);
 
@@ -33,5 +32,4 @@ impl FileName {
     }
 }
 
-/// Maximum length of all arguments together, in bytes.
 const MAX_ARGUMENTS: usize = 512;

@@ -5,7 +5,6 @@ use semihosting::fs::File;
 
 use super::arguments::FileName;
 
-/// The button.
 pub(crate) struct UserButton {
     /// `None` if no file is named: no button.
     name: Option<FileName>,

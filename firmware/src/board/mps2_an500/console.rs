@@ -11,7 +11,6 @@ const UART: u32 = UARTS[3];
 const STATE: u32 = UART + 0x4;
 const STATE_TX_FULL: u32 = 1;
 
-/// Starts the UART.
 pub(crate) fn start() {
     write(UART + 0x10, 16);
     write(UART + 0x8, 1);
@@ -30,7 +29,6 @@ impl Write for ConsoleUart {
     }
 }
 
-/// Prints.
 pub(crate) fn print(text: fmt::Arguments<'_>) {
     let _ = ConsoleUart.write_fmt(text);
 }

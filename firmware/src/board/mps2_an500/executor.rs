@@ -13,7 +13,6 @@ fn pender(_: *mut ()) {
     PENDING.store(true, Ordering::Release);
 }
 
-/// Runs tasks forever.
 pub(super) fn run(init: impl FnOnce(Spawner)) -> ! {
     static EXECUTOR: StaticCell<raw::Executor> = StaticCell::new();
     let executor: &'static raw::Executor = EXECUTOR.init(raw::Executor::new(core::ptr::null_mut()));

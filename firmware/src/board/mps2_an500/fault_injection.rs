@@ -18,13 +18,10 @@ enum InjectedFault {
     /// Never yields.
     Spin,
     Panic,
-    /// Endless recursion.
     Overflow,
-    /// Reads an address without memory.
     Fault,
 }
 
-/// Starts the requested fault.
 pub(super) fn start<const N: usize>(tasks: &Tasks<N>) {
     let asked = argument(2, |name| {
         Some(match name {

@@ -27,7 +27,6 @@ pub(super) fn store() -> Option<StoreFile> {
     Some(StoreFile { flash, record: RECORD.take() })
 }
 
-/// The slots.
 pub(super) fn slots() -> Site<HostFlash> {
     Site { board: BOARD.board, slots: opened() }
 }
@@ -85,7 +84,6 @@ impl StoreFlash for StoreFile {
 /// The arguments with the names of the files. The loader has them too.
 const STORE: usize = 3;
 const SLOTS: usize = 5;
-/// Sectors of the store.
 const STORE_SECTORS: u8 = 2;
 /// Where the loader has its key.
 const KEY: usize = 0x400;

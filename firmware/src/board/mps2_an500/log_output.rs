@@ -21,7 +21,6 @@ impl Log for LogOutput {
     fn flush(&self) {}
 }
 
-/// Installs the logger.
 pub(super) fn start() {
     let _ = log::set_logger(&OUTPUT);
     log::set_max_level(LevelFilter::Info);

@@ -100,7 +100,6 @@ impl platform::Board for Mps2An500 {
         Ok(driver)
     }
 
-    /// Starts it.
     fn watchdog(&mut self) -> Watchdog {
         Watchdog::start()
     }
@@ -126,7 +125,6 @@ impl platform::Board for Mps2An500 {
     }
 }
 
-/// LED 0 of the FPGA.
 #[derive(Debug)]
 pub(crate) struct FpgaLed;
 

@@ -33,7 +33,6 @@ impl fmt::Display for StorageError {
     }
 }
 
-/// Reads the image; called once.
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     static IMAGE: ConstStaticCell<[u8; MAX_IMAGE]> = ConstStaticCell::new([0; MAX_IMAGE]);
     let name = FileName::argument(1).ok_or(StorageError::NoName)?;
@@ -50,7 +49,6 @@ pub(super) fn read() -> Result<&'static [u8], StorageError> {
     Ok(&image[..len])
 }
 
-/// Random bytes of the host.
 pub(super) fn random() -> Option<[u8; 32]> {
     let mut file = File::open(c"/dev/urandom").ok()?;
     let mut bytes = [0; 32];

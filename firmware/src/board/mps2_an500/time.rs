@@ -18,7 +18,6 @@ const CTRL: u32 = TIMER0;
 const VALUE: u32 = TIMER0 + 0x4;
 const RELOAD: u32 = TIMER0 + 0x8;
 const INTCLEAR: u32 = TIMER0 + 0xC;
-/// Enabled, with interrupt.
 const CTRL_ALARM: u32 = 0b1001;
 const CYCLES_PER_MICRO: u64 = 25;
 /// Longest alarm: a later one is set in steps. It also ensures that no overflow of the counter is missed.
@@ -39,7 +38,6 @@ embassy_time_driver::time_driver_impl!(static CLOCK: TimerDriver = TimerDriver {
     state: Mutex::new(RefCell::new(TimerState { queue: Queue::new(), last: 0, rounds: 0 })),
 });
 
-/// Starts the counter.
 pub(super) fn start() {
     write(PRESCALE, 24);
     write(COUNTER, 0);
@@ -89,7 +87,6 @@ impl Driver for TimerDriver {
     }
 }
 
-/// The alarm's interrupt.
 pub(super) fn on_alarm() {
     write(INTCLEAR, 1);
     CLOCK.with(TimerState::rearm);

@@ -17,7 +17,6 @@ use heapless::Deque;
 use super::Irq;
 use super::registers::{UARTS, read, write};
 
-/// UARTs with interrupts.
 const COUNT: usize = 3;
 /// Bytes buffered in each direction.
 const RING: usize = 2048;
@@ -114,18 +113,15 @@ impl UartAccess<'_> {
     }
 }
 
-/// Its receive interrupt.
 pub(super) fn on_rx<const PORT: usize>() {
     with(PORT, |uart| uart.drain());
 }
 
-/// Its transmit interrupt.
 pub(super) fn on_tx<const PORT: usize>() {
     with(PORT, |uart| uart.fill());
 }
 
 impl Uart {
-    /// Starts the UART.
     pub(super) fn open(port: usize) -> Self {
         with(port, |uart| {
             write(uart.base + BAUDDIV, 16);

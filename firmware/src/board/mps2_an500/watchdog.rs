@@ -19,7 +19,6 @@ const CYCLES_PER_MICRO: u64 = 25;
 /// Time without a feed until the reset. Long, because the emulator's host may be busy.
 pub(super) const PERIOD: Duration = Duration::from_secs(8);
 
-/// The watchdog.
 #[derive(Debug)]
 pub(crate) struct Watchdog;
 

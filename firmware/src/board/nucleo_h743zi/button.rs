@@ -5,7 +5,6 @@ use embassy_stm32::gpio::{Input, Pull};
 use embassy_stm32::peripherals::PC13;
 use firmware::platform;
 
-/// The button.
 pub(crate) struct UserButton(Input<'static>);
 
 impl UserButton {

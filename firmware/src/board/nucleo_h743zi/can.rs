@@ -8,7 +8,6 @@ use embassy_stm32::{Peri, peripherals, rcc};
 use embassy_sync::waitqueue::AtomicWaker;
 use firmware::drivers::mcan::{MESSAGE_RAM_WORDS, Mcan, McanBlock, McanError};
 
-/// The CAN controller.
 pub(crate) type CanDevice = Mcan<CanRegisters>;
 
 /// The registers of FDCAN1, and the message RAM, which FDCAN2 does not use.
@@ -62,10 +61,8 @@ fn bypass_calibration() {
     }
 }
 
-/// Receive and transmit.
 pub(super) type CanPins = (Peri<'static, PD0>, Peri<'static, PD1>);
 
-/// Starts the controller.
 pub(super) fn start(pins: CanPins, bitrate: u32) -> Result<CanDevice, McanError> {
     const FUNCTION: u8 = 9;
     let (mut rx, mut tx) = (Flex::new(pins.0), Flex::new(pins.1));

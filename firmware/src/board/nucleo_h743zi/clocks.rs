@@ -9,7 +9,6 @@ use embassy_stm32::rcc::{
 };
 use embassy_stm32::time::Hertz;
 
-/// The source of the clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClockSource {
     /// The 8 MHz of the debugger's crystal.
@@ -33,7 +32,6 @@ pub(super) fn source() -> ClockSource {
     ClockSource::Internal
 }
 
-/// The chip's configuration.
 pub(super) fn config(source: ClockSource) -> Config {
     let mut config = Config::default();
     let rcc = &mut config.rcc;

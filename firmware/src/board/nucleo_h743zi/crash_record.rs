@@ -13,7 +13,6 @@ use firmware::warn;
 
 const MAX_TEXT: usize = 128;
 
-/// Undefined after power-on.
 #[unsafe(link_section = ".uninit.crash_record")]
 static RECORD: Record = Record {
     len: AtomicU32::new(0),
@@ -24,9 +23,7 @@ static RECORD: Record = Record {
 
 #[repr(C, align(8))]
 struct Record {
-    /// Length of the text in bytes.
     len: AtomicU32,
-    /// Hash of the text.
     sum: AtomicU32,
     text: [AtomicU8; MAX_TEXT],
     /// Written last: the RAM's controller holds an incomplete 64-bit word until the next write, and a reset would

@@ -20,7 +20,6 @@ use static_cell::ConstStaticCell;
 use super::leds::BoardLed;
 use firmware::platform::StatusLed;
 
-/// The Ethernet controller.
 pub(crate) type Ethernet = eth::Ethernet<'static, peripherals::ETH, Lan8742>;
 
 /// Why there is no Ethernet.
@@ -200,7 +199,6 @@ const PHY_STATUS: u8 = 1;
 const PHY_ID1: u8 = 2;
 const PHY_ADVERTISE: u8 = 4;
 const PHY_RESULT: u8 = 31;
-/// Microchip, formerly SMSC.
 const PHY_VENDOR: u16 = 0x0007;
 const CONTROL_RESET: u16 = 1 << 15;
 /// Enable and restart auto-negotiation.

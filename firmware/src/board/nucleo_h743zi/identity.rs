@@ -4,7 +4,6 @@ use embassy_stm32::pac::{RCC, RNG};
 use embassy_stm32::uid;
 use embassy_time::Instant;
 
-/// The board's Ethernet address.
 pub(super) fn ethernet_address() -> [u8; 6] {
     firmware::identity::ethernet_address(&uid::uid())
 }

@@ -8,7 +8,6 @@ use embassy_stm32::pac::{GPIOB, RCC};
 use embassy_stm32::peripherals::{PB0, PB14, PE1};
 use firmware::platform::StatusLed;
 
-/// An LED.
 pub(crate) struct BoardLed(Output<'static>);
 
 impl StatusLed for BoardLed {

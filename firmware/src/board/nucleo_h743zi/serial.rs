@@ -11,7 +11,6 @@ use proto_core::config::Rs485;
 /// An RS-485 line.
 pub(crate) type SerialDevice = Usart<UsartRegisters>;
 
-/// The registers of a USART.
 #[derive(Clone, Copy)]
 pub(crate) struct UsartRegisters(usart::Usart);
 

@@ -23,10 +23,7 @@ const _: () = assert!(HEADER <= FLASH_WORD);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum StorageError {
     /// A flash word of it cannot be read.
-    Torn {
-        /// The word's address.
-        address: usize,
-    },
+    Torn { address: usize },
 }
 
 impl fmt::Display for StorageError {

@@ -23,7 +23,6 @@ pub(super) const PERIOD: Duration = Duration::from_secs(4);
 pub(crate) struct Watchdog(IndependentWatchdog<'static, IWDG1>);
 
 impl Watchdog {
-    /// Starts it.
     pub(super) fn start() -> Self {
         // It stops while a debugger halts the core.
         DBGMCU.apb4fzr1().modify(|w| w.set_iwdg1(true));
@@ -81,7 +80,6 @@ fn millis() -> u32 {
     Instant::now().as_millis() as u32
 }
 
-/// Time of the last feed, in milliseconds.
 static FED: AtomicU32 = AtomicU32::new(0);
 /// A hang was saved, which a feed may still disprove.
 static IS_LATE: AtomicBool = AtomicBool::new(false);

@@ -10,11 +10,10 @@ use recipe_api::json;
 use recipe_api::key::SCHEME;
 use recipe_api::nonces::NonceText;
 use recipe_api::response::{ContentType, LAST_CHUNK, Length, Response, StatusCode};
-use recipe_api::revisions::Revision;
+use recipe_api::revisions::{Etag, Revision};
 
 use super::MAX_TIME;
 
-/// Why a reply could not be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum SendError {
     /// The client has closed or reset the connection.
@@ -51,7 +50,6 @@ impl Reply {
         Self { status, kind, etag: None, allow: None, retry_after_s: None, len }
     }
 
-    /// A JSON object with the key `error`.
     pub(super) fn error(buf: &mut [u8], status: StatusCode, text: impl Display) -> Self {
         Self::refusing(buf, status, &text)
     }
@@ -75,11 +73,9 @@ impl Reply {
     }
 }
 
-/// Result of executing a request.
 pub(super) enum RequestOutcome {
     /// A reply that remains to be sent.
     Reply(Reply),
-    /// The reply was sent.
     Sent,
 }
 
@@ -94,7 +90,6 @@ pub(super) struct Responder<'s, 'a> {
 }
 
 impl Responder<'_, '_> {
-    /// Sends bytes; fails at `until`.
     pub(super) async fn send(&mut self, mut bytes: &[u8], until: Instant) -> Result<(), SendError> {
         while !bytes.is_empty() {
             match with_deadline(until, self.socket.write(bytes)).await {
@@ -106,7 +101,6 @@ impl Responder<'_, '_> {
         Ok(())
     }
 
-    /// Sends part of the buffer.
     pub(super) async fn send_part(
         &mut self,
         from: usize,
@@ -124,7 +118,6 @@ impl Responder<'_, '_> {
         Ok(())
     }
 
-    /// Sends a reply with its body.
     pub(super) async fn answer(&mut self, reply: &Reply) -> Result<(), SendError> {
         let body = reply.len.ok_or(SendError::TooLong)?;
         // Behind the body in the buffer, because it contains the body's length.
@@ -187,7 +180,6 @@ impl Responder<'_, '_> {
         self.send(b"\r\n", until).await
     }
 
-    /// Ends a body of chunks.
     pub(super) async fn last_chunk(&mut self) -> Result<(), SendError> {
         self.send(LAST_CHUNK.as_bytes(), Instant::now() + MAX_TIME).await
     }
@@ -231,28 +223,6 @@ impl Display for Challenge<'_> {
     }
 }
 
-/// The ETag of a revision.
-pub(super) struct Etag(pub(super) Revision);
-
-impl Display for Etag {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "\"{}-{:08x}\"", self.0.number, self.0.digest)
-    }
-}
-
-impl Etag {
-    /// The revision with this ETag.
-    pub(super) fn parse(text: &str) -> Option<Revision> {
-        let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
-        let digest = u32::from_str_radix(digest, 16).ok()?;
-        let revision = Revision { number: number.parse().ok()?, digest };
-        // Only the canonical text is accepted.
-        let mut same = heapless::String::<24>::new();
-        write!(same, "{}", Self(revision)).ok()?;
-        (same == text).then_some(revision)
-    }
-}
-
 pub(super) fn busy(buf: &mut [u8]) -> Reply {
     Reply::error(buf, StatusCode::CONFLICT, "something else is being done; try again")
 }
@@ -263,27 +233,7 @@ pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
 
 #[cfg(test)]
 mod tests {
-    use std::string::ToString;
-
     use super::*;
-
-    #[test]
-    fn an_etag_has_one_text() {
-        let revision = Revision { number: 12, digest: 0xBAD_CAFE };
-        assert_eq!(Etag(revision).to_string(), "\"12-0badcafe\"");
-        assert_eq!(Etag::parse("\"12-0badcafe\""), Some(revision));
-        for wrong in [
-            "12-0badcafe",
-            "\"12-badcafe\"",
-            "\"12-0BADCAFE\"",
-            "\"+12-0badcafe\"",
-            "\"012-0badcafe\"",
-            "*",
-            "",
-        ] {
-            assert_eq!(Etag::parse(wrong), None, "{wrong}");
-        }
-    }
 
     #[test]
     fn what_has_no_room_is_noticed_and_nothing_is_written_behind_it() {

@@ -1,4 +1,6 @@
-//! Arguments of operations: those of the head, and those of the body.
+//! A request with the arguments of its operation: those of the head, and those of the body.
+
+use core::net::Ipv4Addr;
 
 use proto_core::engine::PortId;
 use proto_core::time::Duration as Span;
@@ -6,10 +8,20 @@ use recipe_api::arguments::{ArgumentValue, each};
 use recipe_api::key::{KEY_LEN, Key, from_hex};
 use recipe_api::request::{HttpHead, Method};
 use recipe_api::response::StatusCode;
-use recipe_api::revisions::Revision;
+use recipe_api::revisions::{Etag, Revision};
 use recipe_api::route::ApiOperation;
 
-use super::answer::Etag;
+use crate::tasks::store::StoreLock;
+
+/// A request after its head was parsed and its client admitted.
+pub(super) struct ConsoleRequest<'a> {
+    pub(super) head: HeadArguments,
+    pub(super) operation: ApiOperation,
+    pub(super) arguments: Arguments,
+    /// Length of the body in the image buffer of the store handle, and the lock on it.
+    pub(super) image: Option<(usize, StoreLock<'a>)>,
+    pub(super) peer: Ipv4Addr,
+}
 
 /// What a head says beside the operation. It is parsed at once, so that the memory of the head is free for the reply.
 #[derive(Debug, Clone, Copy)]
@@ -19,7 +31,6 @@ pub(super) struct HeadArguments {
     pub(super) number: Option<Option<u32>>,
     /// `downgrade` or `restart`; `Some(false)`: not `yes`.
     pub(super) yes: Option<bool>,
-    /// Frames are wanted.
     pub(super) frames: bool,
     /// The port of the frames; `Some(None)`: there is no such port.
     pub(super) port: Option<Option<PortId>>,
@@ -52,13 +63,14 @@ impl HeadArguments {
     }
 }
 
-/// Arguments parsed from a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Arguments {
     /// The operation takes no arguments.
     None,
-    /// Arguments of `apply`.
-    Apply { number: Option<u32>, trial: Span },
+    Apply {
+        number: Option<u32>,
+        trial: Span,
+    },
     /// The key of `claim`.
     Key([u8; KEY_LEN]),
     /// Duration of the trial of `update/try`, in seconds.
@@ -70,7 +82,6 @@ pub(super) enum Arguments {
 }
 
 impl Arguments {
-    /// Parses a body.
     #[inline(never)]
     pub(super) fn parse(operation: ApiOperation, body: &[u8]) -> Self {
         match operation {

@@ -8,13 +8,12 @@ use proto_core::config::image;
 use recipe_api::claim::{Claim, ClaimError};
 use recipe_api::key::{KEY_LEN, Key};
 use recipe_api::response::{ContentType, StatusCode};
-use recipe_api::revisions::Refused;
+use recipe_api::revisions::{Refused, base_of};
 use recipe_api::route::ApiOperation;
 use recipe_update::Downgrade;
 
-use super::answer::{Etag, Reply, busy, nothing_kept};
-use super::arguments::Arguments;
-use super::request::ConsoleRequest;
+use super::answer::{Reply, busy, nothing_kept};
+use super::arguments::{Arguments, ConsoleRequest};
 use super::{Console, edge};
 use crate::clock::now;
 use crate::fmt::DisplayText;
@@ -22,7 +21,6 @@ use crate::tasks::store::{Failed, StoreLock, StoreRequest};
 use crate::warn;
 
 impl Console {
-    /// Executes a change.
     pub(super) async fn change<'a>(&'a self, buf: &mut [u8], request: ConsoleRequest<'a>) -> Reply {
         let ConsoleRequest { operation, peer, .. } = request;
         if operation == ApiOperation::PutConfig
@@ -175,7 +173,6 @@ impl Console {
     }
 }
 
-/// Whether the request allows an older firmware.
 fn downgrade(buf: &mut [u8], request: &ConsoleRequest<'_>) -> Result<Downgrade, Reply> {
     match request.head.yes {
         None => Ok(Downgrade::Refused),
@@ -201,45 +198,24 @@ fn put_piece<'a>(
 
 fn put<'a>(buf: &mut [u8], request: ConsoleRequest<'a>) -> Result<(StoreRequest, StoreLock<'a>), Reply> {
     let Some((len, lock)) = request.image else { return Err(busy(buf)) };
-    let (status, text) = match request.head.if_match {
-        None => {
-            let text = "If-Match is needed: the ETag of the revision that this one was made from";
-            (StatusCode::PRECONDITION_REQUIRED, text)
+    let base = base_of(request.head.if_match).map_err(|refusal| Reply::refused(buf, &refusal))?;
+    // Trailing bytes would waste flash.
+    let whole = lock.look(len, |bytes| Ok((image::intact(bytes)?, image::image_len(bytes)?)));
+    match whole {
+        Ok((digest, len)) => Ok((StoreRequest::Put { base, digest, len }, lock)),
+        Err(error) => {
+            let error: image::ImageError = error;
+            Err(Reply::error(buf, StatusCode::UNPROCESSABLE, error))
         }
-        Some(None) => (StatusCode::PRECONDITION_FAILED, "If-Match must be one ETag, such as \"3-0badcafe\""),
-        Some(Some(base)) => {
-            // Trailing bytes would waste flash.
-            let whole = lock.look(len, |bytes| Ok((image::intact(bytes)?, image::image_len(bytes)?)));
-            return match whole {
-                Ok((digest, len)) => Ok((StoreRequest::Put { base, digest, len }, lock)),
-                Err(error) => {
-                    let error: image::ImageError = error;
-                    Err(Reply::error(buf, StatusCode::UNPROCESSABLE, error))
-                }
-            };
-        }
-    };
-    Err(Reply::error(buf, status, text))
+    }
 }
 
 fn refuse(buf: &mut [u8], refused: Refused) -> Reply {
-    let (status, text) = match refused {
-        Refused::Changed(base) => {
-            let text = format_args!("the configuration was changed meanwhile; the newest is {}", Etag(base));
-            return Reply::error(buf, StatusCode::PRECONDITION_FAILED, text).about(Some(base));
-        }
-        Refused::OnTrial => {
-            (StatusCode::CONFLICT, "a revision is on trial; confirm it or roll it back first")
-        }
-        Refused::NotOnTrial => (StatusCode::CONFLICT, "no revision is on trial"),
-        Refused::NothingWaits => (StatusCode::CONFLICT, "no stored revision waits; name one"),
-        Refused::Unknown => (StatusCode::NOT_FOUND, "there is no such revision"),
-        Refused::Runs => (StatusCode::CONFLICT, "it is live already"),
-        Refused::Trial => (StatusCode::BAD_REQUEST, "confirm_s is out of range; allowed: 1..=3600"),
-        Refused::NoPrevious => (StatusCode::CONFLICT, "no other revision was live before"),
-        _ => return busy(buf),
+    let base = match refused {
+        Refused::Changed(base) => Some(base),
+        _ => None,
     };
-    Reply::error(buf, status, text)
+    Reply::error(buf, refused.status(), refused).about(base)
 }
 
 /// Name of the operation in the log.

@@ -15,9 +15,8 @@ use recipe_api::response::{CONTINUE, StatusCode};
 use recipe_api::route::{ApiOperation, Served};
 
 use super::answer::{Reply, RequestOutcome, Responder, SendError, busy, nothing_kept};
-use super::arguments::{Arguments, HeadArguments};
+use super::arguments::{Arguments, ConsoleRequest, HeadArguments};
 use super::read::PAGE;
-use super::request::ConsoleRequest;
 use super::{ConnectionPermit, Console, MAX_TIME, PORT};
 use crate::clock::now;
 use crate::tasks::watchdog::Pulse;
@@ -147,7 +146,6 @@ impl Console {
         }
     }
 
-    /// Decides about a request by its head.
     #[inline(never)]
     fn decide(
         &self,
@@ -254,14 +252,12 @@ impl Console {
     }
 }
 
-/// An admitted request.
 struct Decided {
     admitted: Admitted,
     arguments: HeadArguments,
     peer: Ipv4Addr,
 }
 
-/// Result of receiving a body.
 enum BodyRead {
     Whole,
     /// Its hash differs from the signed one.

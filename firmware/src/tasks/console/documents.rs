@@ -10,7 +10,6 @@ use recipe_api::response::{ContentType, Length, StatusCode};
 use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
 use super::{Console, MAX_ANSWER, MAX_TIME};
 
-/// Source of a document.
 #[derive(Debug, Clone)]
 pub(super) enum DocumentSource {
     Pieces(Pieces),
@@ -24,17 +23,19 @@ impl DocumentSource {
 }
 
 impl Console {
-    /// Sends a document as the body of a reply.
     pub(super) async fn document(
         &self,
         responder: &mut Responder<'_, '_>,
-        kind: ContentType,
         mut source: DocumentSource,
     ) -> Result<RequestOutcome, SendError> {
         if self.is_idle() {
             let text = "nothing runs at the moment; try again";
             return Ok(RequestOutcome::Reply(Reply::error(responder.buf, StatusCode::UNAVAILABLE, text)));
         }
+        let kind = match source {
+            DocumentSource::Pieces(_) => ContentType::Json,
+            DocumentSource::Metrics(_) => ContentType::Metrics,
+        };
         if !responder.begin(kind, Length::Chunked, None).await? {
             return Ok(RequestOutcome::Sent);
         }

@@ -8,7 +8,7 @@ use recipe_sparkplug::document::{DocumentError, NodeDocument};
 
 use super::Console;
 use super::answer::{Reply, TextBuffer, busy};
-use super::request::ConsoleRequest;
+use super::arguments::ConsoleRequest;
 use crate::fmt::DisplayText;
 use crate::tasks::edge::View;
 use crate::tasks::store::{StoreLock, StoreRequest};

@@ -15,7 +15,6 @@ mod edge;
 mod firmware;
 mod frames;
 mod read;
-mod request;
 mod stream;
 
 use core::cell::{Cell, RefCell};
@@ -51,7 +50,6 @@ pub struct Console {
     gateway: &'static Gateway,
     /// `None` if the board has no store.
     store: Option<&'static StoreHandle>,
-    /// Field ports of the board.
     ports: Ports,
     node: NodeView,
     name: String<NAME>,
@@ -76,10 +74,8 @@ pub struct NodeView {
     pub clock: &'static WallClock,
 }
 
-/// Counters of connections. They wrap.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
 struct ConnectionCounters {
-    /// Accepted connections.
     connections: u32,
     /// Streams refused because of [`STREAMS`].
     turned_away: u32,

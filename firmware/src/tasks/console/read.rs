@@ -12,13 +12,13 @@ use recipe_api::key::SCHEME;
 use recipe_api::metrics::Families;
 use recipe_api::nonces::MAX_AGE;
 use recipe_api::response::{ContentType, Length, Page, StatusCode};
-use recipe_api::revisions::{Revision, Revisions};
+use recipe_api::revisions::{Etag, Revision, Revisions};
 use recipe_api::route::ApiOperation;
 use serde::Serialize;
 
 use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer, busy, nothing_kept};
+use super::arguments::ConsoleRequest;
 use super::documents::DocumentSource;
-use super::request::ConsoleRequest;
 use super::{Console, MAX_ANSWER, MAX_TIME};
 use crate::clock::now;
 use crate::journal;
@@ -26,7 +26,6 @@ use crate::platform::Ports;
 use crate::tasks::store::{NOTHING, PART, StoreHandle};
 
 impl Console {
-    /// Executes a request.
     pub(super) async fn execute<'a>(
         &'a self,
         responder: &mut Responder<'_, '_>,
@@ -39,19 +38,13 @@ impl Console {
             ApiOperation::Edge => self.edge(responder.buf, StatusCode::OK),
             ApiOperation::Update => self.firmware(responder.buf, StatusCode::OK),
             ApiOperation::Status => {
-                return self
-                    .document(responder, ContentType::Json, DocumentSource::of(Document::Status))
-                    .await;
+                return self.document(responder, DocumentSource::of(Document::Status)).await;
             }
             ApiOperation::Values => {
-                return self
-                    .document(responder, ContentType::Json, DocumentSource::of(Document::Values))
-                    .await;
+                return self.document(responder, DocumentSource::of(Document::Values)).await;
             }
             ApiOperation::Metrics => {
-                return self
-                    .document(responder, ContentType::Metrics, DocumentSource::Metrics(Families::new()))
-                    .await;
+                return self.document(responder, DocumentSource::Metrics(Families::new())).await;
             }
             ApiOperation::Stream => return self.stream(responder, &request).await,
             ApiOperation::Log => return log(responder, &request).await,
@@ -176,7 +169,6 @@ impl Console {
     }
 }
 
-/// Sends the newest lines of the log.
 async fn log(
     responder: &mut Responder<'_, '_>,
     request: &ConsoleRequest<'_>,
@@ -227,7 +219,6 @@ async fn page(
     Ok(RequestOutcome::Sent)
 }
 
-/// Writes the document `revisions`.
 fn write_revisions(
     out: &mut TextBuffer<'_>,
     store: &StoreHandle,
@@ -238,9 +229,9 @@ fn write_revisions(
     let stored = revisions.kept().iter().filter(|revision| **revision != NOTHING);
     for (nth, revision) in stored.enumerate() {
         let comma = if nth == 0 { "" } else { "," };
-        write!(out, "{comma}{{\"revision\":{},\"etag\":\"", revision.number)?;
-        write_etag(out, *revision)?;
-        out.write_str("\"}")?;
+        write!(out, "{comma}{{\"revision\":{},\"etag\":", revision.number)?;
+        json::write_text(out, Etag(*revision))?;
+        out.write_char('}')?;
     }
     out.write_char(']')?;
     let real = |number: Option<u32>| number.filter(|number| *number != NOTHING.number);
@@ -261,9 +252,8 @@ fn write_revisions(
         write!(out, ",\"trial\":{{\"revision\":{number},\"left_s\":{}.{:03}}}", left / 1_000, left % 1_000)?;
     }
     if let Some(base) = revisions.base() {
-        out.write_str(",\"base\":\"")?;
-        write_etag(out, base)?;
-        out.write_char('"')?;
+        out.write_str(",\"base\":")?;
+        json::write_text(out, Etag(base))?;
     }
     if let Some((number, ended)) = revisions.last() {
         write!(out, ",\"last\":{{\"revision\":{number},\"ended\":\"{}\"}}", ended.name())?;
@@ -278,16 +268,10 @@ fn write_revisions(
     out.write_char('}')
 }
 
-/// Inside a JSON string: quotes escaped.
-fn write_etag(out: &mut TextBuffer<'_>, revision: Revision) -> fmt::Result {
-    write!(out, "\\\"{}-{:08x}\\\"", revision.number, revision.digest)
-}
-
 fn write_json(out: &mut TextBuffer<'_>, value: &impl Serialize) -> fmt::Result {
     json::write(out, value).map_err(|_| fmt::Error)
 }
 
-/// The web page.
 pub(super) const PAGE: Page =
     Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
 /// Bytes of it per write.

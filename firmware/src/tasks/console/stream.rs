@@ -11,8 +11,8 @@ use recipe_api::documents::Document;
 use recipe_api::response::{ContentType, Length, StatusCode};
 
 use super::answer::{Reply, RequestOutcome, Responder, SendError, TextBuffer};
+use super::arguments::ConsoleRequest;
 use super::documents::DocumentSource;
-use super::request::ConsoleRequest;
 use super::{ConnectionPermit, Console, MAX_TIME, STREAMS};
 
 impl Console {

@@ -39,7 +39,6 @@ const PORT: u16 = 50_000;
 const FIELD: PortId = PortId(0);
 /// Maximum age of a delivered frame.
 const TIMEOUT: Duration = Duration::from_secs(1);
-/// Of the controller.
 const FRAME: [u8; 5] = [0xFF, 0xFF, 0x01, 0xEE, 0xEE];
 
 /// Frames that wait for each host, and which hosts are cut off.
@@ -52,7 +51,6 @@ struct Wire {
     frames_sent: Cell<usize>,
     /// Sender and contents of all frames, also of those not delivered.
     log: RefCell<Vec<(u8, Vec<u8>)>>,
-    /// Speed of time.
     step: Cell<Duration>,
 }
 
@@ -86,7 +84,6 @@ impl Wire {
     }
 }
 
-/// Of TCP.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Segment {
     from: u16,

@@ -138,7 +138,6 @@ impl LinkDriver<'_> {
     }
 }
 
-/// Why a socket's loop ended.
 enum SocketEnd {
     /// The turn is over or the socket failed.
     End,

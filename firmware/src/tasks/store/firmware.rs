@@ -13,7 +13,6 @@ use crate::stored::{StoreFlash, image_version};
 use crate::update::{TrialVerdict, UpdateError, WaitsFor, Works};
 use crate::{error, info, warn};
 
-/// State of the firmware's trial.
 pub(super) enum TrialState {
     /// Nothing is on trial.
     Settled,
@@ -23,7 +22,6 @@ pub(super) enum TrialState {
     Restart,
 }
 
-/// Counts the links and ports that work.
 fn works(gateway: &Gateway) -> Works {
     gateway.report(|status| {
         let is_up = |state| matches!(state, LinkState::Up { .. } | LinkState::Shared);
@@ -78,7 +76,6 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
         Ok(0)
     }
 
-    /// Updates the view for readers.
     pub(super) fn show(&self, waits_for: Option<WaitsFor>) {
         let updates = &self.updates;
         let trial = self.trial.map(|trial| (trial.until(), waits_for.unwrap_or(WaitsFor::Time)));

@@ -14,6 +14,7 @@ use recipe_api::revisions::{Refused, Revision, Revisions};
 use recipe_store::{KeepError, SlotMarks};
 use recipe_update::{BoardName, Downgrade, Header, Slot};
 
+use crate::journal::Truncated;
 use crate::update::{self, Build, Incoming, WaitsFor};
 
 /// A request to the store task.
@@ -114,7 +115,6 @@ pub const PART: usize = 512;
 /// Shared by the store task and its clients.
 pub struct StoreHandle {
     pub(super) revisions: RefCell<Option<Revisions>>,
-    /// The configuration that runs.
     pub(super) running: Cell<Option<u32>>,
     pub(super) failure: RefCell<String<MAX_FAILURE>>,
     /// The lock is taken; there is one change at a time.
@@ -188,8 +188,7 @@ impl StoreHandle {
     pub fn failed(&self, why: &impl core::fmt::Display) {
         let mut failure = self.failure.borrow_mut();
         failure.clear();
-        // Truncated to the capacity.
-        let _ = core::fmt::Write::write_fmt(&mut Cut(&mut failure), format_args!("{why}"));
+        let _ = core::fmt::Write::write_fmt(&mut Truncated(&mut failure), format_args!("{why}"));
     }
 
     /// Takes the lock for a change; `None` if another change holds it.
@@ -245,9 +244,6 @@ impl StoreLock<'_> {
     }
 
     /// Validates some more of the first `len` bytes of the image buffer. Returns whether there is more to do.
-    ///
-    /// # Errors
-    /// The image is invalid.
     pub fn scan(&self, len: usize) -> Result<bool, ImageError> {
         self.look(len, |bytes| self.handle.scan.borrow_mut().step(bytes))
     }
@@ -274,17 +270,5 @@ impl Drop for StoreLock<'_> {
         if !self.is_asked {
             self.handle.is_taken.set(false);
         }
-    }
-}
-
-/// Writes text and truncates it at the capacity.
-struct Cut<'a>(&'a mut String<MAX_FAILURE>);
-
-impl core::fmt::Write for Cut<'_> {
-    fn write_str(&mut self, text: &str) -> core::fmt::Result {
-        for letter in text.chars() {
-            self.0.push(letter).map_err(|_| core::fmt::Error)?;
-        }
-        Ok(())
     }
 }

@@ -95,7 +95,6 @@ pub(crate) fn life(changes: usize, lens: &[usize]) -> Vec<Change> {
 }
 
 impl Change {
-    /// Whether it succeeded.
     pub(crate) fn attempt(&self, store: &mut Store, flash: &mut Nor) -> bool {
         let done = match self {
             Self::Keep { number, image } => {
@@ -169,7 +168,6 @@ impl StoreBench {
         self.store = Store::mount(&self.flash).expect("it always starts");
     }
 
-    /// Whether it succeeded.
     pub(crate) fn attempt(&mut self, change: &Change) -> bool {
         change.attempt(&mut self.store, &mut self.flash)
     }

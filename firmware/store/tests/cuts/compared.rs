@@ -31,7 +31,6 @@ impl ErrorType for Adapter {
     type Error = PowerLoss;
 }
 
-/// It needs three.
 const SECTORS: Geometry = Geometry { sectors: 3, words: 4096 };
 const SECTOR: usize = SECTORS.words as usize * WORD;
 

@@ -13,9 +13,6 @@ pub struct Folder {
 
 impl Folder {
     /// Makes the folder if it is not there.
-    ///
-    /// # Errors
-    /// If it cannot be made or read.
     pub fn open(path: &Path) -> io::Result<Self> {
         fs::create_dir_all(path)?;
         let folder = Self { path: path.to_owned() };
@@ -29,9 +26,6 @@ impl Folder {
     }
 
     /// All parts of all runs, the oldest first, with their sizes.
-    ///
-    /// # Errors
-    /// If the folder cannot be read.
     pub fn parts(&self) -> io::Result<Vec<(PathBuf, u64)>> {
         let mut parts = Vec::new();
         for entry in fs::read_dir(&self.path)? {
@@ -48,9 +42,6 @@ impl Folder {
     }
 
     /// Removes the oldest parts until all take at most so many bytes.
-    ///
-    /// # Errors
-    /// If one cannot be removed.
     pub fn make_room(&self, bytes: u64) -> io::Result<()> {
         let parts = self.parts()?;
         let mut used: u64 = parts.iter().map(|(_, len)| len).sum();
@@ -65,9 +56,6 @@ impl Folder {
     }
 
     /// The parts of the newest run; empty if there is none.
-    ///
-    /// # Errors
-    /// If the folder cannot be read.
     pub fn newest_run(&self) -> io::Result<Vec<PathBuf>> {
         let parts: Vec<_> = self.parts()?.into_iter().map(|(path, _)| path).collect();
         let Some(run) = parts.last().and_then(|path| run_of(path)) else { return Ok(Vec::new()) };

@@ -136,7 +136,6 @@ impl RecordingPart {
         Ok(())
     }
 
-    /// Ends the file.
     pub(super) fn finish(mut self) -> io::Result<()> {
         let result = self.writer.finish().map(|_| ()).map_err(io_error);
         self.kept(result)?;

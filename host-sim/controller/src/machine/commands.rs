@@ -10,7 +10,6 @@ use super::{
 };
 use crate::motion::Braking;
 
-/// Who starts a program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Starter {
     Client,

@@ -141,7 +141,6 @@ impl Machine {
         }
     }
 
-    /// Whether the safety controller keeps the power off.
     pub(super) fn safety_forbids_power(&self) -> bool {
         matches!(self.hold, Some(SafetyHold::Update | SafetyHold::Fail))
     }

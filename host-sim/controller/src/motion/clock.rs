@@ -4,7 +4,6 @@ use proto_core::time::{Duration, Instant};
 
 use super::Braking;
 
-/// The path time of a move.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PathClock {
     anchor: Instant,
@@ -17,7 +16,6 @@ pub(super) struct PathClock {
     slope: f64,
 }
 
-/// Path time and its derivatives at one instant.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PathTime {
     /// Seconds of path time.
@@ -34,7 +32,6 @@ impl PathClock {
         Self { anchor: Instant::ZERO, position_s: 0.0, rate: 0.0, target: 0.0, slope: NORMAL_SLOPE }
     }
 
-    /// At 0, running from `now` on.
     pub(super) fn running(now: Instant, rate: f64) -> Self {
         Self { anchor: now, position_s: 0.0, rate, target: rate, slope: NORMAL_SLOPE }
     }

@@ -7,7 +7,6 @@ mod inverse;
 
 pub(super) use inverse::{Branch, length};
 
-/// Number of joints.
 pub(super) const JOINTS: usize = 6;
 
 /// A position and an orientation.

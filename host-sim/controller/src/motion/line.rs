@@ -130,7 +130,6 @@ impl LinearPath {
         [here, first, second]
     }
 
-    /// The joints at the end.
     pub(super) fn end(&self) -> [f64; JOINTS] {
         self.samples.last().copied().unwrap_or_default()
     }

@@ -8,7 +8,6 @@
 //! later. Every received frame is applied at once.
 
 mod clients;
-mod counters;
 mod receive;
 mod recipe;
 mod send;
@@ -20,9 +19,9 @@ use proto_core::recipe::model::Mode;
 use proto_core::schedule::Grid;
 use proto_core::time::{Duration, Instant};
 
+use crate::counters::RecipePortCounters;
 use clients::Clients;
 pub use clients::MAX_UDP_CLIENTS;
-pub use counters::RecipePortCounters;
 pub(crate) use receive::Listening;
 pub use receive::MAX_INBOX;
 use receive::Received;
@@ -31,7 +30,6 @@ pub use recipe::RecipeError;
 use recipe_config::{SimBus, SimConfig, SimPort};
 pub(crate) use send::{Handed, PortData};
 
-/// A recipe port.
 #[derive(Debug)]
 pub(super) struct RecipePort {
     name: String,
@@ -173,7 +171,6 @@ impl RecipePort {
         self.cycle
     }
 
-    /// Sets the cycle, from the next output on.
     pub(super) fn set_cycle(&mut self, now: Instant, epoch: Instant, cycle: Duration) {
         self.cycle = cycle.max(MIN_CYCLE);
         if self.grid.is_some() {
@@ -183,7 +180,6 @@ impl RecipePort {
         }
     }
 
-    /// Everything given to the port has left.
     pub(super) fn sent(&mut self) {
         if self.transmitter == Transmitter::Sending {
             self.transmitter = Transmitter::Idle;

@@ -11,7 +11,8 @@ use proto_core::wire::can::{CanFrame, CanId};
 use proto_core::wire::scalar::Scalar;
 
 use super::recipe::PartLayouts;
-use super::{Medium, RecipePort, RecipePortCounters, Transmitter};
+use super::{Medium, RecipePort, Transmitter};
+use crate::counters::RecipePortCounters;
 use crate::registers::Registers;
 
 /// A frame of a user recipe, for a program.
@@ -71,7 +72,6 @@ impl RecipePort {
         }
     }
 
-    /// A datagram arrived at the UDP server.
     pub(crate) fn client_sent(&mut self, now: Instant, peer: SocketAddr) {
         self.forget_silent(now);
         if let Medium::UdpServer(clients) = &mut self.medium
@@ -131,7 +131,6 @@ impl RecipePort {
         );
     }
 
-    /// The oldest frame that waits for a program.
     pub(crate) fn next_received(&mut self) -> Option<Received> {
         self.inbox.pop_front()
     }

@@ -7,7 +7,6 @@ use proto_core::wire::can::CanId;
 
 use recipe_config::{SimBus, SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 
-/// The layouts of a recipe's parts.
 #[derive(Debug, Clone)]
 pub(super) enum PartLayouts {
     Stream { input: Option<Box<StreamLayout>>, output: Option<Box<StreamLayout>> },

@@ -12,7 +12,6 @@ use super::recipe::{self, PartLayouts};
 use super::{Medium, RecipePort, Transmitter};
 use std::net::SocketAddr;
 
-/// Data that a port sends.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum PortData {
     Bytes(Vec<u8>),
@@ -74,7 +73,6 @@ impl RecipePort {
         Ok(Handed::Over)
     }
 
-    /// When the next frame is due.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         let grid = self.grid.as_ref().map(Grid::next);
         let waiting = match self.transmitter {
@@ -84,7 +82,6 @@ impl RecipePort {
         [grid, waiting].into_iter().flatten().min()
     }
 
-    /// The frames that are due.
     pub(crate) fn poll(&mut self, now: Instant, image: &[u8; IMAGE_BYTES]) -> Vec<PortData> {
         if let Some(missed) = self.grid.as_mut().and_then(|grid| grid.due(now)) {
             self.counters.skipped_cycles += missed;

@@ -12,7 +12,6 @@ use super::script::CALL_PROGRAM;
 use super::text::one_line;
 use super::{Call, CallReply};
 
-/// Registers all of them.
 pub(super) fn register(engine: &mut Engine, link: &Arc<ScriptLink>) {
     register_ports(engine, link);
     register_items(engine, link);

@@ -18,7 +18,6 @@ pub struct Script {
 /// Why a script does not compile.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ScriptError {
-    /// What is wrong, and where.
     message: String,
     /// 1-based line in the script, when it is known.
     line: Option<usize>,

@@ -19,7 +19,6 @@ struct CoilByte {
     valid_bits: u8,
 }
 
-/// One holding register.
 #[derive(Debug, Clone, Copy, Default)]
 enum Word {
     #[default]

@@ -9,7 +9,6 @@ use super::{PLACES, Registers, named, set_bit};
 /// Edges and shown bits.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Functional {
-    /// Edges since they were last taken.
     risen: Risen,
     /// For each byte of functional outputs, the bits that show a state, and their present values.
     shown: [(u8, u8); OUTPUTS.len()],
@@ -23,7 +22,6 @@ pub(crate) struct Risen {
 }
 
 impl Risen {
-    /// Whether this input has risen.
     pub(crate) fn has(&self, item: InitialTarget) -> bool {
         match (item.var_bit(), item) {
             (Some(bit), _) => {
@@ -61,12 +59,10 @@ impl Registers {
         place.is_some_and(|nth| self.functional.shown[nth].0 & bit.mask().unwrap_or(0) != 0)
     }
 
-    /// The bytes of functional inputs.
     pub(super) fn functional_inputs(&self) -> [u8; INPUTS.len()] {
         PLACES.functional_inputs.map(|offset| self.image[offset])
     }
 
-    /// Notes the edges since the bytes were `before`.
     pub(super) fn note_edges(&mut self, before: [u8; INPUTS.len()]) {
         let after = self.functional_inputs();
         for (risen, (before, after)) in self.functional.risen.bytes.iter_mut().zip(before.iter().zip(after)) {
@@ -97,7 +93,6 @@ impl Registers {
 /// The bytes of functional inputs; the tool's buttons are no variable.
 pub(super) const INPUTS: [(&str, u32); 3] =
     [("BitInputReg", 1), ("BitInputReg", 2), ("DigitalSignalStatus", 7)];
-/// The bytes of functional outputs.
 pub(super) const OUTPUTS: [(&str, u32); 3] =
     [("BitOutputReg", 1), ("BitOutputReg", 2), ("DigitalSignalStatus", 8)];
 

@@ -83,7 +83,6 @@ impl Registers {
         self.forced.release(item);
     }
 
-    /// Writes every system variable that is in the packet.
     fn put_variables(&self, packet: &mut [u8; LEN]) {
         for PacketRange { image, packet: place } in SHOWN.iter() {
             let value = self.image.get(image.clone());

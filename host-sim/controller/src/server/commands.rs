@@ -20,14 +20,12 @@ use crate::machine::{ErrorId, Transition, TransitionProgress};
 use crate::program;
 use crate::{ConnId, Controller, ControllerOutput};
 
-/// A connection of port 2000.
 #[derive(Debug, Default)]
 pub(super) struct Session {
     parser: CommandServer,
     /// Commands that wait until the one before is answered.
     waiting: VecDeque<(Command, EventText)>,
     pending: Option<Pending>,
-    /// The command that is being executed.
     current: EventText,
 }
 
@@ -42,7 +40,6 @@ struct Pending {
     until: Instant,
 }
 
-/// A complete command.
 #[derive(Debug, Clone, PartialEq)]
 enum Command {
     Run { program: String, speed: Option<Percent> },
@@ -54,7 +51,6 @@ enum Command {
     Unknown,
 }
 
-/// The next step of a connection.
 enum Next {
     Answer(Action, TransitionProgress),
     Execute(Command),
@@ -100,7 +96,6 @@ impl Controller {
         }
     }
 
-    /// Executes commands that silence has completed.
     pub(super) fn poll_commands(&mut self, now: Instant) {
         let due = |session: &Session| session.parser.deadline().is_some_and(|deadline| now >= deadline);
         let sessions = self.server.command.iter();

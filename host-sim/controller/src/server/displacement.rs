@@ -11,7 +11,6 @@ use proto_core::time::{Duration, Instant};
 
 use super::{ConnId, Link};
 
-/// The clients of all servers.
 #[derive(Debug, Default)]
 pub(super) struct ClientActivities(BTreeMap<ConnId, ClientActivity>);
 
@@ -19,7 +18,6 @@ pub(super) struct ClientActivities(BTreeMap<ConnId, ClientActivity>);
 struct ClientActivity {
     link: Link,
     from: IpAddr,
-    /// Whether it has sent a complete request.
     has_asked: bool,
     /// The newest request or answer, or the connection's start.
     newest: Instant,

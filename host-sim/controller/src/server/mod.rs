@@ -32,7 +32,6 @@ pub const MAX_MODBUS_CONNECTIONS: usize = 128;
 /// Maximum number of answers that a fault delays; further ones are dropped.
 const MAX_DELAYED: usize = 1_024;
 
-/// The connections of all servers.
 #[derive(Debug, Default)]
 pub(super) struct Server {
     command: BTreeMap<ConnId, Box<Session>>,
@@ -52,7 +51,6 @@ impl Server {
         commands.chain(self.delayed.iter().map(|delayed| delayed.0)).min()
     }
 
-    /// Closes all connections of a server, and returns them.
     fn close_link(&mut self, link: Link, outputs: &mut VecDeque<ControllerOutput>) -> Vec<ConnId> {
         let conns: Vec<ConnId> = match link {
             Link::Command => std::mem::take(&mut self.command).into_keys().collect(),
@@ -65,7 +63,6 @@ impl Server {
         conns
     }
 
-    /// The number of a server's connections.
     pub(super) fn open(&self, link: Link) -> usize {
         match link {
             Link::Command => self.command.len(),
@@ -108,7 +105,6 @@ impl Controller {
         self.client_event(now, link, conn, true);
     }
 
-    /// Closes all connections of a server.
     pub(super) fn close_clients(&mut self, link: Link) {
         let now = self.recorder.now();
         for conn in self.server.close_link(link, &mut self.outputs) {
@@ -116,7 +112,6 @@ impl Controller {
         }
     }
 
-    /// Closes all connections of all servers.
     pub(super) fn close_all_clients(&mut self) {
         for link in [Link::Command, Link::State, Link::Modbus] {
             self.close_clients(link);
@@ -284,7 +279,6 @@ pub(super) enum Requested {
     Changes,
 }
 
-/// When an answer is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ResponseTiming {
     Now,

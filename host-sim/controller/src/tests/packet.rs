@@ -2,7 +2,6 @@
 
 use super::*;
 
-/// A packet later.
 fn next(cell: &mut TestController) -> proto_core::wire::state::StatePacket {
     cell.run_ms(100);
     cell.packets.last().unwrap().1

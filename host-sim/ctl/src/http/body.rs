@@ -109,7 +109,6 @@ impl Unframer {
     }
 }
 
-/// The length of the chunk after this line.
 fn size(line: &[u8]) -> Option<u64> {
     let line = std::str::from_utf8(line).ok()?.strip_suffix("\r\n")?;
     let digits = line.split(';').next()?.trim_end_matches([' ', '\t']);

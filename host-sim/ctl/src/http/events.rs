@@ -2,7 +2,6 @@
 //!
 //! In: the bytes of a stream, in any pieces. Out: events. One that is longer than [`MAX_EVENT`] ends the stream.
 
-/// An event with its data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ServerEvent {
     pub(crate) name: String,
@@ -12,7 +11,6 @@ pub(crate) struct ServerEvent {
 /// Maximum length of an event in bytes, with everything around it.
 pub(crate) const MAX_EVENT: usize = 1 << 20;
 
-/// Finds the events of a stream.
 #[derive(Debug, Default)]
 pub(crate) struct EventParser {
     line: Vec<u8>,

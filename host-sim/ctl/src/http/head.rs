@@ -10,7 +10,6 @@ pub(crate) const MAX_HEAD: usize = 16 << 10;
 /// Maximum number of its fields.
 const MAX_FIELDS: usize = 100;
 
-/// A status and the fields behind it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct HttpHead {
     pub(crate) status: u16,
@@ -31,7 +30,6 @@ pub(crate) enum Framing {
 /// Why bytes are no head.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum HeadError {
-    /// More is needed.
     Incomplete,
     /// It is longer than [`MAX_HEAD`].
     TooLong,
@@ -100,7 +98,6 @@ impl HttpHead {
         self.fields.iter().filter(move |(known, _)| known == name).map(|(_, value)| value.as_str())
     }
 
-    /// How the body ends.
     pub(crate) fn framing(&self) -> Result<Framing, HeadError> {
         if self.status < 200 {
             // Too many that only announce another one.

@@ -28,20 +28,17 @@ const MAX_BODY: usize = 1 << 20;
 /// Maximum number of heads before the real one.
 const MAX_ANNOUNCED: usize = 8;
 
-/// A request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HttpRequest<'a> {
     pub(crate) method: &'static str,
     /// The address that the server knows itself by; `None` if it is that of the connection.
     pub(crate) host: Option<&'a str>,
-    /// Path and query.
     pub(crate) target: &'a str,
     /// Lines of the head, each with a name and a value.
     pub(crate) fields: &'a [(&'static str, String)],
     pub(crate) body: &'a [u8],
 }
 
-/// An answer.
 #[derive(Debug, Clone)]
 pub(crate) struct HttpReply {
     head: HttpHead,
@@ -64,11 +61,9 @@ impl HttpReply {
 pub(crate) enum NoReply {
     /// No connection was made; nothing was sent.
     Unreached(io::Error),
-    /// The connection was reset.
     Reset(String),
     /// It ended, or took too long, or is none.
     Broken(String),
-    /// The command shall end.
     Stopped,
 }
 
@@ -79,7 +74,6 @@ pub(crate) struct HttpExchange {
     /// The end of the time for the head, and for a body that is read as a whole.
     deadline: Instant,
     timeout: Duration,
-    /// Bytes behind the head.
     rest: Vec<u8>,
     head: HttpHead,
     stop: Stop,

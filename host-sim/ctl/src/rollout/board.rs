@@ -22,9 +22,6 @@ pub struct Real<'a> {
 }
 
 /// The version of the firmware in an update.
-///
-/// # Errors
-/// It contains no firmware.
 pub fn version_of(update: &Update) -> Result<String, Failure> {
     let links = update.links();
     let version = links.first().map(|link| link.header.version().to_string());
@@ -32,9 +29,6 @@ pub fn version_of(update: &Update) -> Result<String, Failure> {
 }
 
 /// The gateways of an inventory as boards that get this update, each with its name.
-///
-/// # Errors
-/// The update contains no firmware.
 pub fn real_boards<'a>(
     members: &'a [Member],
     update: &'a Update,

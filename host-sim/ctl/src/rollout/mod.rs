@@ -8,12 +8,10 @@ mod board;
 mod report;
 
 use std::fmt;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::failure::Failure;
-use crate::fleet::MAX_AT_ONCE;
+use crate::fleet::side_by_side;
 use crate::stop::Stop;
 use crate::update::Health;
 
@@ -28,9 +26,6 @@ pub trait RolloutBoard: Sync {
     /// It is not reached, or is no board that takes this firmware.
     fn inspect(&self) -> Result<BoardInfo, Failure>;
     /// How it does.
-    ///
-    /// # Errors
-    /// It is not reached.
     fn health(&self) -> Result<Health, Failure>;
     /// Sends the firmware, or what is missing of it. What runs stays.
     ///
@@ -43,9 +38,6 @@ pub trait RolloutBoard: Sync {
     /// It is refused, or the board does not come back with it.
     fn begin(&self) -> Result<(), Failure>;
     /// Confirms the firmware on trial.
-    ///
-    /// # Errors
-    /// It is refused, or the board not reached.
     fn confirm(&self) -> Result<(), Failure>;
     /// Takes back what is on trial: returns once the board runs the firmware before.
     ///
@@ -83,7 +75,7 @@ pub enum BoardState {
 /// How a rollout goes through the boards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RolloutPlan {
-    /// So many at a time, at most [`MAX_AT_ONCE`] of them side by side; the next ones begin once these have ended.
+    /// So many at a time, at most [`MAX_AT_ONCE`](crate::MAX_AT_ONCE) of them side by side; the next ones begin once these have ended.
     pub batch: usize,
     /// Begin no further batch once a board has failed.
     pub stop_on_failure: bool,
@@ -182,7 +174,17 @@ pub fn roll_out<B: RolloutBoard>(
         if stop.is_asked() || plan.stop_on_failure && report.failed().next().is_some() {
             break;
         }
-        let ended = run_batch(boards, plan, stop, notify);
+        let ended = side_by_side(
+            boards,
+            stop,
+            |(name, _)| RolloutEntry::new(name),
+            |(name, board)| {
+                let mut entry = RolloutEntry::new(name);
+                entry.outcome = run_board(board, plan, &mut entry, notify);
+                notify(RolloutEvent::Ended(&entry));
+                entry
+            },
+        );
         for (entry, ended) in report.entries.iter_mut().skip(nth * size).zip(ended) {
             *entry = ended;
         }
@@ -191,32 +193,6 @@ pub fn roll_out<B: RolloutBoard>(
     }
     report.was_stopped |= stop.is_asked();
     report
-}
-
-fn run_batch<B: RolloutBoard>(
-    boards: &[(String, B)],
-    plan: RolloutPlan,
-    stop: &Stop,
-    notify: &(dyn Fn(RolloutEvent<'_>) + Sync),
-) -> Vec<RolloutEntry> {
-    let next = AtomicUsize::new(0);
-    let entries: Vec<_> = boards.iter().map(|(name, _)| Mutex::new(RolloutEntry::new(name))).collect();
-    std::thread::scope(|scope| {
-        for _ in 0..boards.len().min(MAX_AT_ONCE) {
-            scope.spawn(|| {
-                while !stop.is_asked()
-                    && let nth = next.fetch_add(1, Relaxed)
-                    && let (Some((name, board)), Some(place)) = (boards.get(nth), entries.get(nth))
-                {
-                    let mut entry = RolloutEntry::new(name);
-                    entry.outcome = run_board(board, plan, &mut entry, notify);
-                    notify(RolloutEvent::Ended(&entry));
-                    *place.lock().unwrap_or_else(PoisonError::into_inner) = entry;
-                }
-            });
-        }
-    });
-    entries.into_iter().map(|entry| entry.into_inner().unwrap_or_else(PoisonError::into_inner)).collect()
 }
 
 fn run_board<B: RolloutBoard>(
@@ -313,12 +289,6 @@ fn recover<B: RolloutBoard>(board: &B, plan: RolloutPlan, entry: &mut RolloutEnt
         }
         board.wait(LOOK);
     }
-}
-
-/// A health on one line.
-fn words(health: &Health) -> String {
-    let Health { word, links_up, ports_working } = health;
-    format!("{word}, {links_up} links up, {ports_working} ports working")
 }
 
 fn failed(step: RolloutStep, failure: &Failure, left: Left) -> BoardOutcome {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
 
-use super::{BoardOutcome, Left, RolloutEntry, words};
+use super::{BoardOutcome, Left, RolloutEntry};
 use crate::failure::{Failure, Verdict};
 use crate::table::{Look, TableCell, TableView, TextTable};
 use crate::update::Health;
@@ -43,7 +43,7 @@ impl RolloutReport {
     /// A table with a row for each board.
     pub fn table(&self, view: TableView) -> String {
         let health = |health: &Option<Health>| {
-            health.as_ref().map_or(TableCell::of(""), |health| TableCell::of(words(health)))
+            health.as_ref().map_or(TableCell::of(""), |health| TableCell::of(health.to_string()))
         };
         let mut table = TextTable::new(&["gateway", "was", "before", "after", "outcome"]);
         for entry in &self.entries {

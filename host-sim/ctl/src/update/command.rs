@@ -111,9 +111,6 @@ fn settled(
 }
 
 /// `update` without a file: what the board says, after confirming or taking back if that is asked for.
-///
-/// # Errors
-/// It is refused, or the board not reached.
 pub fn shown(client: &Client) -> Result<Answer, Failure> {
     let firmware = Firmware::of(client)?;
     let text = firmware.text();
@@ -121,9 +118,6 @@ pub fn shown(client: &Client) -> Result<Answer, Failure> {
 }
 
 /// `update --confirm` without a file.
-///
-/// # Errors
-/// It is refused, or the board not reached.
 pub fn confirmed(client: &Client) -> Result<Answer, Failure> {
     let firmware = confirm(client)?;
     let text = firmware.text();

@@ -32,9 +32,6 @@ impl fmt::Display for Health {
 }
 
 /// How the board does.
-///
-/// # Errors
-/// It is refused, or not reached.
 pub fn health(client: &Client) -> Result<Health, Failure> {
     let status = client.json("status")?;
     let count = |list: &str, is_well: &dyn Fn(&str) -> bool| {

@@ -101,7 +101,7 @@ pub fn push(
             None => client.call(&Call::get("update")),
         };
         let firmware = match asked {
-            Ok(reply) => answered(client, reply)?,
+            Ok(reply) => Firmware::read(client, client.document(&client.accepted(reply)?)?)?,
             Err(failure) => {
                 let since = *lost.get_or_insert_with(Instant::now);
                 if since.elapsed() > AWAY || client.stop().wait(AGAIN) {
@@ -156,15 +156,7 @@ fn put(
         return Err(client.refused("it asks for bytes that the firmware does not have"));
     };
     let path = format!("update?offset={offset}{}", more(downgrade, '&'));
-    let more_time = Duration::ZERO;
-    let call =
-        Call { method: "PUT", path: &path, body: RequestBody::Image(piece), if_match: None, more_time };
-    client.call(&call)
-}
-
-/// The document of an answer.
-fn answered(client: &Client, reply: HttpReply) -> Result<Firmware, Failure> {
-    Firmware::read(client, client.document(&client.accepted(reply)?)?)
+    client.call(&Call { method: "PUT", body: RequestBody::Image(piece), ..Call::get(&path) })
 }
 
 /// Runs what was received on trial: returns when the board has restarted with it.
@@ -227,9 +219,6 @@ pub fn wait_confirmed(
 }
 
 /// Keeps the firmware that is on trial.
-///
-/// # Errors
-/// It is refused, or the board not reached.
 pub fn confirm(client: &Client) -> Result<Firmware, Failure> {
     post(client, "update/confirm", &json!({}))
 }
@@ -245,8 +234,7 @@ pub fn take_back(client: &Client, progress: &mut dyn FnMut(UpdateProgress)) -> R
 }
 
 fn post(client: &Client, path: &str, arguments: &Value) -> Result<Firmware, Failure> {
-    let call = Call { more_time: REPLACING, ..Call::post(path, arguments) };
-    answered(client, client.call(&call)?)
+    Firmware::read(client, client.ask(&Call { more_time: REPLACING, ..Call::post(path, arguments) })?)
 }
 
 /// The board, once it is `there` again.
@@ -282,7 +270,6 @@ fn back(
     }
 }
 
-/// How a trial ended, in words.
 pub(super) fn ended_words(ended: &str) -> &str {
     match ended {
         "confirmed" => "it was confirmed",
@@ -308,5 +295,4 @@ const AWAY: Duration = Duration::from_secs(60);
 const REPLACING: Duration = Duration::from_secs(10);
 /// Time that a board may take to start again: three starts that the watchdog ends, and the one before.
 const RESTARTING: Duration = Duration::from_secs(60);
-/// Time between two looks.
 pub(super) const AGAIN: Duration = Duration::from_millis(300);

@@ -64,7 +64,6 @@ pub(crate) enum Reply {
 /// Writes to a connection.
 type Writing = Box<dyn FnOnce(&mut TcpStream) -> std::io::Result<()> + Send>;
 
-/// A document with a status.
 pub(crate) fn document(status: u16, fields: &str, body: &Value) -> Reply {
     bytes(status, "application/json", fields, body.to_string().as_bytes())
 }

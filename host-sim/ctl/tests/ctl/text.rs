@@ -89,7 +89,6 @@ fn what_is_read_is_laid_out_in_tables() {
     assert_eq!(recipe_ctl::log(&client, 2).unwrap().text(WIDE), "one\ntwo\n");
 }
 
-/// Without colours.
 fn plain(text: String) -> String {
     ["\u{1b}[31m", "\u{1b}[32m", "\u{1b}[33m", "\u{1b}[0m"]
         .iter()

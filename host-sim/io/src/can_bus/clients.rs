@@ -18,14 +18,12 @@ use crate::fairness::{arrival_time, yield_fairly};
 use crate::tcp_options;
 use crate::timer::now;
 
-/// An slcan client on TCP.
 #[derive(Debug)]
 pub(crate) struct SlcanClient {
     pub(crate) stream: TcpStream,
     pub(crate) session: RefCell<SlcanSession>,
 }
 
-/// The slcan clients on TCP.
 pub(crate) type Clients = RefCell<Vec<Rc<SlcanClient>>>;
 
 /// The slcan state of a client.
@@ -246,9 +244,7 @@ fn flush(io: &impl ByteStream, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()>
     Ok(())
 }
 
-/// Maximum number of slcan clients on TCP.
 pub(super) const MAX_CLIENTS: usize = 32;
-/// Maximum number of bytes per read from a client.
 const CHUNK: usize = 256;
 /// The same for bytes that waited while the process slept, whose frames are dropped. A terminal with more
 /// waiting returns exactly this number.

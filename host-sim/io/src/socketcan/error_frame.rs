@@ -7,11 +7,9 @@ use socketcan::{CanErrorFrame, EmbeddedFrame};
 /// What an error frame says about the controller's state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StateChange {
-    /// The new state.
     State(BusState),
     /// The controller was restarted after bus-off.
     Restarted,
-    /// Nothing.
     Other,
 }
 
@@ -52,7 +50,6 @@ pub(super) fn counters(frame: CanErrorFrame) -> Option<(u8, u8)> {
     }
 }
 
-/// Whether the adapter lost received frames.
 pub(super) fn is_overflow(frame: CanErrorFrame) -> bool {
     let problems = frame.into_error().controller().unwrap_or(ControllerProblems::empty());
     problems.contains(ControllerProblems::RX_OVERFLOW)

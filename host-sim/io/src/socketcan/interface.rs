@@ -40,7 +40,6 @@ impl Interface {
         Self::query(interface).unwrap_or(Self { has_carrier: true, bitrate: None, state: None })
     }
 
-    /// The controller's state.
     pub(super) fn bus(self) -> BusState {
         if self.has_carrier { self.state.unwrap_or(BusState::Active) } else { BusState::BusOff }
     }
@@ -123,7 +122,6 @@ const NLM_F_REQUEST: u16 = 1;
 const FLAGS: u16 = 0xC000;
 /// IFLA_CAN_BITTIMING: a structure that begins with the bit rate.
 const CAN_BIT_TIMING: u16 = 1;
-/// IFLA_CAN_STATE.
 const CAN_STATE: u16 = 4;
 /// Maximum length of an answer; one about an interface has about 2 KiB.
 const MAX_ANSWER: usize = 16 * 1_024;

@@ -9,7 +9,6 @@ use std::os::fd::{AsRawFd, BorrowedFd};
 use proto_core::wire::can::{CanFrame, CanId};
 use socketcan::CanErrorFrame;
 
-/// A received message.
 #[derive(Debug)]
 pub(super) struct CanMessage {
     pub(super) content: Content,

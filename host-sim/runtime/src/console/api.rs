@@ -7,7 +7,7 @@ use proto_core::time::Duration;
 use recipe_api::key::SCHEME;
 use recipe_api::nonces::MAX_AGE;
 use recipe_api::response::{ContentType, StatusCode};
-use recipe_api::revisions::{Refused, Revision, TRIAL};
+use recipe_api::revisions::{Etag, Refused, base_of};
 use recipe_api::route::ApiOperation;
 use recipe_io::timer::now;
 use serde::Deserialize;
@@ -16,13 +16,12 @@ use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::http::HttpRequest;
-use super::reading::{etag, host_name, nothing_runs, revisions};
+use super::reading::{host_name, nothing_runs, revisions};
 use super::reply::HttpReply;
 use super::supervisor::{ActionError, SupervisorAction, SupervisorCommand, SupervisorView};
 use super::{ConsoleServer, ConsoleSource, check, pendant};
 
 impl ConsoleServer {
-    /// Executes a request.
     pub(super) async fn execute(&self, request: HttpRequest<'_>) -> HttpReply {
         match (request.admitted.operation, &self.source) {
             (ApiOperation::Page, _) => HttpReply::page(request.head.if_none_match),
@@ -137,7 +136,7 @@ impl ConsoleServer {
                 shown["revision"] = json!(revision);
                 let reply = HttpReply::json(status, &shown);
                 match view.revisions.as_ref().and_then(|revisions| revisions.revision(revision)) {
-                    Some(revision) => reply.with("ETag", etag(revision)),
+                    Some(revision) => reply.with("ETag", Etag(revision)),
                     None => reply,
                 }
             }
@@ -178,17 +177,11 @@ fn config(view: &SupervisorView, request: &HttpRequest<'_>) -> HttpReply {
         Some(Err(_)) => return HttpReply::error(StatusCode::BAD_REQUEST, "revision must be a number"),
     };
     match (revisions.revision(number), view.texts.get(&number)) {
-        (Some(revision), _) if request.head.if_none_match == Some(etag(revision).as_str()) => {
-            let reply = HttpReply {
-                status: StatusCode::NOT_MODIFIED,
-                kind: ContentType::Toml,
-                body: "".into(),
-                fields: Vec::new(),
-            };
-            reply.with("ETag", etag(revision))
+        (Some(revision), _) if request.head.if_none_match.and_then(Etag::parse) == Some(revision) => {
+            HttpReply::new(StatusCode::NOT_MODIFIED, ContentType::Toml, "").with("ETag", Etag(revision))
         }
         (Some(revision), Some(text)) => {
-            HttpReply::text(ContentType::Toml, Rc::from(&**text)).with("ETag", etag(revision))
+            HttpReply::text(ContentType::Toml, Rc::from(&**text)).with("ETag", Etag(revision))
         }
         _ => refusal(Refused::Unknown),
     }
@@ -236,16 +229,7 @@ fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, HttpReply
 
 /// A configuration to store: refused here if it could not run.
 fn put(request: &HttpRequest<'_>, overrides: &[String]) -> Result<SupervisorAction, HttpReply> {
-    let Some(base) = request.head.if_match else {
-        let text = "If-Match is needed: the ETag of the revision that this one was made from";
-        return Err(HttpReply::error(StatusCode::PRECONDITION_REQUIRED, text));
-    };
-    let Some(base) = parse_etag(base) else {
-        return Err(HttpReply::error(
-            StatusCode::PRECONDITION_FAILED,
-            "If-Match must be one ETag, such as \"3-0badcafe\"",
-        ));
-    };
+    let base = base_of(request.head.if_match.map(Etag::parse))?;
     let toml = String::from_utf8(request.body.clone());
     let toml =
         toml.map_err(|error| HttpReply::error(StatusCode::UNPROCESSABLE, &format!("not UTF-8: {error}")))?;
@@ -255,38 +239,14 @@ fn put(request: &HttpRequest<'_>, overrides: &[String]) -> Result<SupervisorActi
     }
 }
 
-fn parse_etag(text: &str) -> Option<Revision> {
-    let (number, digest) = text.strip_prefix('"')?.strip_suffix('"')?.split_once('-')?;
-    let revision = Revision { number: number.parse().ok()?, digest: u32::from_str_radix(digest, 16).ok()? };
-    (etag(revision) == text).then_some(revision)
-}
-
 fn refusal(refused: Refused) -> HttpReply {
-    let (status, text) = match refused {
-        Refused::Busy => (StatusCode::CONFLICT, "something else is being done; try again".to_owned()),
-        Refused::OnTrial => {
-            (StatusCode::CONFLICT, "a revision is on trial; confirm it or roll it back first".to_owned())
-        }
-        Refused::NotOnTrial => (StatusCode::CONFLICT, "no revision is on trial".to_owned()),
-        Refused::Changed(base) => {
-            let text = format!("the configuration was changed meanwhile; the newest is {}", etag(base));
-            return HttpReply::error(StatusCode::PRECONDITION_FAILED, &text).with("ETag", etag(base));
-        }
-        Refused::NothingWaits => (StatusCode::CONFLICT, "no stored revision waits; name one".to_owned()),
-        Refused::Unknown => (StatusCode::NOT_FOUND, "there is no such revision".to_owned()),
-        Refused::Runs => (StatusCode::CONFLICT, "it is live already".to_owned()),
-        Refused::Trial => {
-            let seconds = |at: &Duration| at.as_millis() / 1_000;
-            let (min, max) = (seconds(TRIAL.start()), seconds(TRIAL.end()));
-            (StatusCode::BAD_REQUEST, format!("confirm_s is out of range; allowed: {min}..={max}"))
-        }
-        Refused::NoPrevious => (StatusCode::CONFLICT, "no other revision was live before".to_owned()),
-        other => (StatusCode::CONFLICT, format!("refused: {other:?}")),
-    };
-    HttpReply::error(status, &text)
+    let reply = HttpReply::error(refused.status(), &refused.to_string());
+    match refused {
+        Refused::Changed(base) => reply.with("ETag", Etag(base)),
+        _ => reply,
+    }
 }
 
-/// For the log.
 fn name(operation: ApiOperation) -> &'static str {
     match operation {
         ApiOperation::PutConfig => "store",

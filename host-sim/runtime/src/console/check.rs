@@ -25,7 +25,6 @@ pub(super) fn prepare(name: &str, toml: &str, overrides: &[String]) -> Result<Pr
     Ok(Prepared { config: config.into(), decoder: Arc::new(Decoder::new(&model)) })
 }
 
-/// The gateway of a text.
 pub(super) fn gateway(
     name: &str,
     toml: &str,
@@ -84,7 +83,6 @@ pub(super) fn report(toml: &str) -> Value {
 /// The name of a text that came in a request.
 pub(super) const NAME: &str = "config";
 
-/// A mistake in a text.
 #[derive(Debug)]
 pub(super) struct Mistake {
     message: String,

@@ -9,6 +9,7 @@ use std::time::Duration;
 use proto_core::engine::{TapDirection, TapPlace, TapVerdict};
 use proto_core::time::Instant;
 use proto_core::wire::can::CanId;
+use recipe_api::key::Hex;
 use recipe_capture::pcapng::{Pcapng, Scope};
 use recipe_capture::{Arrived, Cell, Frame, Interest, Next, Record, Subscription, Watch, What};
 use serde_json::{Value, json};
@@ -55,12 +56,11 @@ impl FrameEvents {
         if self.port.as_ref().is_some_and(|only| *only != port.name) {
             return None;
         }
-        let bytes: String = frame.bytes.iter().map(|byte| format!("{byte:02x}")).collect();
         let mut shown = json!({
             "time_us": at.as_micros(),
             "port": port.name,
             "direction": if frame.direction == TapDirection::In { "in" } else { "out" },
-            "bytes": bytes,
+            "bytes": Hex(&frame.bytes).to_string(),
         });
         match frame.can_id {
             None => {}
@@ -88,7 +88,6 @@ impl FrameEvents {
     }
 }
 
-/// A capture for one client.
 pub(super) struct CaptureStream {
     subscription: Subscription,
     capture: Pcapng,

@@ -63,7 +63,6 @@ impl ConsoleServer {
         });
     }
 
-    /// Serves one request.
     async fn serve(self: &Rc<Self>, mut stream: TcpStream, peer: SocketAddr) -> io::Result<()> {
         stream.set_nodelay(true)?;
         let local = stream.local_addr()?;
@@ -136,7 +135,6 @@ impl ConsoleServer {
         self.answer(&mut stream, &reply, admitted.is_head).await
     }
 
-    /// Reads a body; `None` if it did not arrive.
     async fn body(
         &self,
         stream: &mut TcpStream,

@@ -74,7 +74,6 @@ pub(crate) struct Bound {
 }
 
 impl ConsoleOptions {
-    /// Opens the socket.
     pub(crate) fn bind(&self) -> Result<Bound, RunError> {
         let refused =
             |why: &dyn std::fmt::Display| RunError::new(format!("--console {}: {why}", self.address));
@@ -165,7 +164,6 @@ impl Console {
         Ok(Self { address, end, thread })
     }
 
-    /// Its address.
     pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
@@ -181,9 +179,6 @@ impl Drop for Console {
 }
 
 /// Runs a gateway with a console, which can replace its configuration, until Ctrl-C, SIGTERM or SIGHUP.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn run_gateway(file: ConfigFile, console: &ConsoleOptions, options: &RunOptions) -> Result<(), RunError> {
     let publisher = options.sparkplug.clone().map(Publisher::start).transpose()?;
     let snapshot_watch = publisher.as_ref().map(Publisher::snapshot_watch);
@@ -191,7 +186,6 @@ pub fn run_gateway(file: ConfigFile, console: &ConsoleOptions, options: &RunOpti
     host::foreground(Box::new(supervised), options)
 }
 
-/// A simulated controller with a console.
 #[derive(Debug)]
 pub(crate) struct Consoled {
     ready: Value,
@@ -201,7 +195,6 @@ pub(crate) struct Consoled {
 }
 
 impl Consoled {
-    /// Serves a console for a controller that runs.
     pub(crate) fn start(bound: Bound, handle: Handle, log: Option<Log>) -> Result<Self, RunError> {
         let control = handle.place("control").parse();
         let control = control.map_err(|error| RunError::new(format!("control socket: {error}")))?;
@@ -236,7 +229,6 @@ impl ForegroundRun for Consoled {
     }
 }
 
-/// Everything that the connections share.
 struct ConsoleServer {
     address: SocketAddr,
     peer: Option<u16>,
@@ -251,10 +243,8 @@ struct ConsoleServer {
     started: proto_core::time::Instant,
 }
 
-/// Counters of connections.
 #[derive(Debug, Clone, Copy, Default, serde::Serialize)]
 struct ServerCounters {
-    /// Connections.
     connections: u64,
     /// Connections turned away because there were too many.
     turned_away: u64,

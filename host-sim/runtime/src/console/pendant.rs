@@ -12,7 +12,6 @@ use tokio::time::timeout;
 
 use super::reply::HttpReply;
 
-/// Executes the operation in a body.
 pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {
     let request = match serde_json::from_slice::<Map<String, Value>>(body) {
         Ok(request) => request,
@@ -29,7 +28,7 @@ pub(super) async fn operate(control: SocketAddr, body: &[u8]) -> HttpReply {
         Ok(Ok(answer)) => {
             let is_done = serde_json::from_str::<Value>(&answer).is_ok_and(|answer| answer["ok"] == true);
             let status = if is_done { StatusCode::OK } else { StatusCode::UNPROCESSABLE };
-            HttpReply { status, kind: ContentType::Json, body: answer.trim_end().into(), fields: Vec::new() }
+            HttpReply::new(status, ContentType::Json, answer.trim_end())
         }
         Ok(Err(error)) => HttpReply::error(StatusCode::UNAVAILABLE, &format!("control socket: {error}")),
         Err(_) => HttpReply::error(
@@ -50,7 +49,5 @@ async fn ask(control: SocketAddr, line: &str) -> io::Result<String> {
     }
 }
 
-/// How long an operation may take.
 const MAX_TIME: Duration = Duration::from_secs(30);
-/// Maximum length of an answer.
 const MAX_ANSWER: u64 = 4 << 20;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use proto_core::config::GatewayConfig;
 use recipe_api::request::HttpHead;
 use recipe_api::response::{ContentType, StatusCode};
-use recipe_api::revisions::Revision;
+use recipe_api::revisions::Etag;
 use recipe_api::route::{ApiOperation, Served};
 use recipe_config::FileKind;
 use recipe_config::file::Text;
@@ -87,7 +87,6 @@ impl ConsoleServer {
         info
     }
 
-    /// The newest lines of the log.
     fn log(&self, head: &HttpHead<'_>) -> HttpReply {
         let count = match head.query("lines").map(str::parse) {
             None => MAX_NEWEST,
@@ -219,14 +218,13 @@ fn decoded(text: &str) -> Option<Cow<'_, str>> {
     String::from_utf8(bytes).ok().map(Cow::Owned)
 }
 
-/// The revisions, and what happens to them.
 pub(super) fn revisions(view: &SupervisorView) -> Value {
     let Some(revisions) = &view.revisions else { return json!({ "kept": [] }) };
     let kept: Vec<_> = view
         .entries
         .iter()
         .map(|entry| {
-            let etag = revisions.revision(entry.number).map(etag);
+            let etag = revisions.revision(entry.number).map(|revision| Etag(revision).to_string());
             json!({ "revision": entry.number, "etag": etag, "stored_at": entry.stored_at, "from": entry.from })
         })
         .collect();
@@ -241,7 +239,7 @@ pub(super) fn revisions(view: &SupervisorView) -> Value {
     show("waiting", revisions.waiting().map(Value::from));
     let trial = left_of(revisions.trial());
     show("trial", trial.map(|(number, left_s)| json!({ "revision": number, "left_s": left_s })));
-    show("base", revisions.base().map(|base| Value::from(etag(base))));
+    show("base", revisions.base().map(|base| Value::from(Etag(base).to_string())));
     show(
         "last",
         revisions.last().map(|(number, ended)| json!({ "revision": number, "ended": ended.name() })),
@@ -252,10 +250,6 @@ pub(super) fn revisions(view: &SupervisorView) -> Value {
 
 pub(super) fn nothing_runs() -> HttpReply {
     HttpReply::error(StatusCode::UNAVAILABLE, "nothing runs at the moment; try again")
-}
-
-pub(super) fn etag(revision: Revision) -> String {
-    format!("\"{}-{:08x}\"", revision.number, revision.digest)
 }
 
 /// The machine's host name.

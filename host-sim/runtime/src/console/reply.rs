@@ -7,7 +7,6 @@ use recipe_api::guard::Refusal;
 use recipe_api::response::{ContentType, Length, Page, Response, StatusCode};
 use serde_json::{Value, json};
 
-/// A response with its body.
 #[derive(Debug)]
 pub(super) struct HttpReply {
     pub(super) status: StatusCode,
@@ -19,7 +18,6 @@ pub(super) struct HttpReply {
 /// What a response carries.
 #[derive(Debug)]
 pub(super) enum ReplyBody {
-    /// A text.
     Text(Rc<str>),
     /// Part of the program.
     Bytes(&'static [u8]),
@@ -44,31 +42,27 @@ impl<T: Into<Rc<str>>> From<T> for ReplyBody {
 }
 
 impl HttpReply {
+    pub(super) fn new(status: StatusCode, kind: ContentType, body: impl Into<ReplyBody>) -> Self {
+        Self { status, kind, body: body.into(), fields: Vec::new() }
+    }
+
     /// A document that was made before.
     pub(super) fn text(kind: ContentType, body: Rc<str>) -> Self {
-        Self { status: StatusCode::OK, kind, body: ReplyBody::Text(body), fields: Vec::new() }
+        Self::new(StatusCode::OK, kind, body)
     }
 
-    /// The page for people, unless the client has it.
     pub(super) fn page(if_none_match: Option<&str>) -> Self {
         let status = PAGE.status(if_none_match);
-        let body = ReplyBody::Bytes(if status == StatusCode::OK { PAGE.bytes } else { &[] });
-        Self { status, kind: ContentType::Page, body, fields: Vec::new() }
+        let bytes = if status == StatusCode::OK { PAGE.bytes } else { &[] };
+        Self { body: ReplyBody::Bytes(bytes), ..Self::new(status, ContentType::Page, "") }
     }
 
-    /// A configuration image.
     pub(super) fn image(bytes: Vec<u8>) -> Self {
-        Self {
-            status: StatusCode::OK,
-            kind: ContentType::Image,
-            body: ReplyBody::Made(bytes),
-            fields: Vec::new(),
-        }
+        Self { body: ReplyBody::Made(bytes), ..Self::new(StatusCode::OK, ContentType::Image, "") }
     }
 
-    /// A JSON value.
     pub(super) fn json(status: StatusCode, value: &Value) -> Self {
-        Self { status, kind: ContentType::Json, body: value.to_string().into(), fields: Vec::new() }
+        Self::new(status, ContentType::Json, value.to_string())
     }
 
     /// An object with `error`.
@@ -96,7 +90,6 @@ impl From<Refusal> for HttpReply {
     }
 }
 
-/// A whole response.
 pub(super) fn bytes_of(reply: &HttpReply) -> Vec<u8> {
     let body = reply.body.as_bytes();
     let mut bytes = head_of(reply, Length::Bytes(body.len() as u64)).into_bytes();
@@ -104,7 +97,6 @@ pub(super) fn bytes_of(reply: &HttpReply) -> Vec<u8> {
     bytes
 }
 
-/// The text of a head.
 pub(super) fn head_of(reply: &HttpReply, length: Length) -> String {
     let fields: Vec<(&str, &dyn std::fmt::Display)> =
         reply.fields.iter().map(|(name, value)| (*name, value as &dyn std::fmt::Display)).collect();

@@ -19,7 +19,6 @@ use super::ConsoleSource;
 use crate::findings::{look_at_states, unexplained};
 use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 
-/// The newest snapshot.
 #[derive(Default)]
 pub(super) struct Snapshots {
     newest: RefCell<Option<Rc<Snapshot>>>,
@@ -109,7 +108,6 @@ impl Snapshots {
 }
 
 impl Snapshot {
-    /// The document `status`.
     pub(super) fn status(&self) -> Rc<str> {
         let make = || match &self.what {
             SnapshotContent::Controller(stats) => stats.to_string(),
@@ -118,7 +116,6 @@ impl Snapshot {
         Rc::clone(self.status.get_or_init(|| make().into()))
     }
 
-    /// The document `values`.
     pub(super) fn values(&self) -> Option<Rc<str>> {
         let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         let make = || {
@@ -127,7 +124,6 @@ impl Snapshot {
         Some(Rc::clone(self.values.get_or_init(|| make().into())))
     }
 
-    /// The metrics.
     pub(super) fn metrics(&self) -> Option<Rc<str>> {
         let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         let make = || written(|text| Families::new().write_all(snapshot.engine.status(snapshot.at), text));

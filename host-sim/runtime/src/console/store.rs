@@ -19,7 +19,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::RunError;
 
-/// The revisions with their texts.
 #[derive(Debug)]
 pub(super) struct RevisionStore {
     folder: Option<StoreFolder>,
@@ -102,9 +101,8 @@ impl RevisionStore {
         written.map_err(|error| RunError::new(format!("--console-state: {error}")))
     }
 
-    /// The machine of these revisions.
     pub(super) fn revisions(&self) -> Option<Revisions> {
-        let mut kept = heapless_revisions();
+        let mut kept = proto_core::heapless::Vec::new();
         for entry in &self.index.kept {
             kept.push(self.revision(entry.number)?).ok()?;
         }
@@ -116,12 +114,10 @@ impl RevisionStore {
         &self.index.kept
     }
 
-    /// The text of a revision.
     pub(super) fn text(&self, number: u32) -> Option<&Arc<str>> {
         self.texts.get(&number)
     }
 
-    /// Texts by revision number.
     pub(super) fn texts(&self) -> &BTreeMap<u32, Arc<str>> {
         &self.texts
     }
@@ -130,7 +126,6 @@ impl RevisionStore {
         Some(Revision { number, digest: digest(self.text(number)?) })
     }
 
-    /// Stores a text as a revision.
     pub(super) fn keep(
         &mut self,
         number: u32,
@@ -142,7 +137,6 @@ impl RevisionStore {
         self.put(number, text, forget, index)
     }
 
-    /// Marks a revision as live.
     pub(super) fn mark(&mut self, live: u32, previous: u32) -> io::Result<()> {
         let index = Index { live, previous: Some(previous), ..self.index.clone() };
         self.write_index(&index)?;
@@ -245,10 +239,6 @@ fn lock(path: &Path) -> io::Result<File> {
     let lock = File::options().create(true).truncate(false).write(true).open(path.join("lock"))?;
     flock(&lock, FlockOperation::NonBlockingLockExclusive)?;
     Ok(lock)
-}
-
-fn heapless_revisions() -> proto_core::heapless::Vec<Revision, MAX_REVISIONS> {
-    proto_core::heapless::Vec::new()
 }
 
 fn name(number: u32) -> String {

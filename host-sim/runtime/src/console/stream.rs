@@ -21,7 +21,6 @@ use super::frames::{CaptureStream, FrameEvents};
 use super::reply::{HttpReply, MAX_TIME, bytes_of, head_of};
 use super::{ConsoleServer, ConsoleSource};
 
-/// An endless response.
 enum Endless {
     Events(Option<FrameEvents>),
     Capture(Box<CaptureStream>),
@@ -50,7 +49,6 @@ pub(super) async fn serve(
     }
 }
 
-/// The stream for a request.
 fn endless(
     server: &ConsoleServer,
     operation: ApiOperation,
@@ -86,7 +84,7 @@ async fn follow(server: &Rc<ConsoleServer>, stream: TcpStream, endless: Endless)
     };
     // Waiting events become old: about a second of them is enough.
     let _ = sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER);
-    let reply = HttpReply { status: StatusCode::OK, kind, body: "".into(), fields: Vec::new() };
+    let reply = HttpReply::new(StatusCode::OK, kind, "");
     let (mut read, mut write) = stream.into_split();
     let send = async {
         put(server, &mut write, head_of(&reply, Length::Endless).as_bytes()).await?;

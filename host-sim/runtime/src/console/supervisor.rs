@@ -47,9 +47,6 @@ pub struct ConfigFile {
 
 impl ConfigFile {
     /// Reads a file.
-    ///
-    /// # Errors
-    /// If it cannot be read.
     pub fn read(path: &Path, overrides: Vec<String>) -> Result<Self, RunError> {
         let name = path.display().to_string();
         match std::fs::read_to_string(path) {
@@ -59,7 +56,6 @@ impl ConfigFile {
     }
 }
 
-/// A request of a client.
 #[derive(Debug)]
 pub(crate) struct SupervisorCommand {
     pub(super) peer: IpAddr,
@@ -68,7 +64,6 @@ pub(crate) struct SupervisorCommand {
     pub(super) answer: oneshot::Sender<Result<u32, ActionError>>,
 }
 
-/// A request of a client.
 #[derive(Debug)]
 pub(super) enum SupervisorAction {
     /// Store a text that was derived from revision `base`.
@@ -81,14 +76,12 @@ pub(super) enum SupervisorAction {
         number: Option<u32>,
         trial: Duration,
     },
-    /// Confirm the revision on trial.
     Confirm,
     /// Return to the previous revision.
     RollBack,
     Shutdown,
 }
 
-/// Why a request failed.
 #[derive(Debug)]
 pub(super) enum ActionError {
     Refused(Refused),
@@ -96,14 +89,11 @@ pub(super) enum ActionError {
     Tried(String),
 }
 
-/// The supervisor's state, for readers.
 #[derive(Debug, Default)]
 pub(crate) struct SupervisorView {
-    /// The revisions.
     pub(super) revisions: Option<Revisions>,
     /// Their metadata, the oldest first.
     pub(super) entries: Vec<RevisionEntry>,
-    /// Their texts.
     pub(super) texts: BTreeMap<u32, Arc<str>>,
     /// The addresses of what runs, as in the line `ready`.
     pub(super) ready: Value,
@@ -111,14 +101,12 @@ pub(crate) struct SupervisorView {
     pub(super) failure: Option<String>,
     /// Overrides, which apply to every revision.
     pub(super) overrides: Vec<String>,
-    /// The running configuration.
     pub(super) config: Option<Arc<GatewayConfig>>,
     client: Option<RuntimeClient>,
     slot: Option<Arc<SnapshotSlot>>,
 }
 
 impl SupervisorView {
-    /// The text of the configuration that runs.
     pub(super) fn running_text(&self) -> Option<Arc<str>> {
         self.config.as_ref()?;
         self.texts.get(&self.revisions.as_ref()?.running()?).cloned()
@@ -251,7 +239,6 @@ impl ForegroundRun for Supervised {
 
 /// A running gateway that can be replaced.
 struct Replaceable {
-    /// The number of its revision.
     number: u32,
     handle: Handle,
     slot: Arc<SnapshotSlot>,

@@ -36,7 +36,6 @@ pub(super) struct ControlClient {
     follows: RefCell<Option<Follow>>,
     /// Whether it makes no more requests.
     has_ended: Cell<bool>,
-    /// Wakes the task's writing half.
     wake: Notify,
     /// Wakes its reading half after a write.
     written: Notify,
@@ -94,7 +93,6 @@ impl ControlClient {
 }
 
 impl ControllerRuntime {
-    /// Accepts the clients of the control socket.
     pub(super) async fn serve_control(self: Rc<Self>, listener: TcpListener) {
         loop {
             let failed = |error: &io::Error| {
@@ -133,7 +131,6 @@ impl ControllerRuntime {
         });
     }
 
-    /// Serves a client until it leaves.
     async fn read_lines(&self, stream: TcpStream, client: &ControlClient) -> io::Result<()> {
         tcp_options::enable_keepalive(&stream);
         let (read, mut write) = stream.into_split();
@@ -283,7 +280,6 @@ impl ControllerRuntime {
 enum ControlLine {
     Whole,
     TooLong,
-    /// There is none.
     End,
 }
 

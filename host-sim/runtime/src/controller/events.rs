@@ -6,7 +6,6 @@ use super::ControllerRuntime;
 use recipe_controller::Happened;
 
 impl ControllerRuntime {
-    /// Reports the events since the last call.
     pub(super) fn report_events(&self) {
         for client in self.control_clients.borrow().iter() {
             client.notify();

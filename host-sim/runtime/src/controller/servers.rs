@@ -107,7 +107,6 @@ impl ControllerRuntime {
         }
     }
 
-    /// Sends a datagram from port 2011.
     pub(super) fn send_datagram(&self, peer: SocketAddr, bytes: &[u8]) {
         // One call may fail with the error of an earlier datagram.
         for _ in 0..2 {

@@ -24,7 +24,6 @@ pub(super) struct WaitingClient {
     timeout_s: f64,
     /// With the number of the first event that counts.
     condition: Option<(Condition, u64)>,
-    /// Whether the condition has held.
     held: bool,
     answer: oneshot::Sender<Result<(), String>>,
 }

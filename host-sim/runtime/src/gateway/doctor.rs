@@ -114,7 +114,6 @@ pub(super) fn start(config: GatewayConfig, span: Span) -> Result<(Doctor, Findin
     Ok((Doctor { buffers, filled }, texts))
 }
 
-/// An empty record of each port.
 fn records(config: &GatewayConfig, binds: &[Bind]) -> Vec<PortRecord> {
     let record = config.view().field_ports().map(|(index, port, _)| {
         let mut record = PortRecord::new(PortId(index));
@@ -159,9 +158,6 @@ fn log_changes(
 /// Nothing is sent to the controller: connections are opened and closed, and only the state stream is read. Nothing is
 /// sent to the field, unless `ask` is set: then ports with exchanges send theirs. SIGINT, SIGTERM and SIGHUP end the
 /// listening early.
-///
-/// # Errors
-/// The reason why it could not start; nothing is left behind then.
 pub fn listen(
     config: GatewayConfig,
     binds: Vec<Bind>,

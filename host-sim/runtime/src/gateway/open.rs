@@ -28,7 +28,6 @@ use recipe_io::port::{BusSettings, OpenPort};
 use recipe_io::tcp_options;
 use recipe_io::timer::now;
 
-/// What ports are bound to.
 pub(super) struct Devices<'a> {
     pub(super) binds: &'a [Bind],
     /// Devices of the previous gateway, and where this one puts its own; `None` if it closes them.
@@ -153,7 +152,6 @@ fn begin_tapping(
         .map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
 }
 
-/// The configuration image.
 fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, RunError> {
     let mut bytes = vec![0; image::MAX_IMAGE];
     let len = image::encode(config, &mut bytes).map_err(|error| RunError::new(error.to_string()))?;
@@ -216,7 +214,6 @@ async fn open_endpoint(to: To<'_>) -> Result<LinkEndpoint, RunError> {
 }
 
 impl LinkEndpoint {
-    /// The address of a listening link.
     fn place(&self) -> String {
         let address = match self {
             Self::TcpListen { listener, .. } => listener.local_addr(),

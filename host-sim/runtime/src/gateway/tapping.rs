@@ -28,14 +28,12 @@ const MAX_MESSAGE: usize = 128 << 10;
 /// Poll interval of the reader when the ring is empty. The gateway does not wake it, which would be a system call.
 const READ_INTERVAL: Duration = Duration::from_millis(2);
 
-/// The gateway's side.
 #[derive(Debug)]
 pub(super) struct Tapping {
     watch: Watch,
     ring: Producer<u8>,
     /// The message being built.
     message: Vec<u8>,
-    /// The message being built exceeds its maximum length.
     is_too_long: bool,
     /// Passes are recorded from the start of the engine on.
     records_passes: bool,
@@ -100,7 +98,6 @@ impl Tapping {
         }
     }
 
-    /// After the call.
     #[inline]
     pub(super) fn behind(&mut self, tap: &mut Tap) {
         if self.records_passes {
@@ -278,7 +275,6 @@ fn parse(message: &[u8]) -> Option<Record> {
     Some(Record { at: Instant::from_micros(u64::from_le_bytes(*at)), lost: u32::from_le_bytes(*lost), what })
 }
 
-/// Kinds of messages.
 const FRAME: u8 = 0;
 const PASS: u8 = 1;
 

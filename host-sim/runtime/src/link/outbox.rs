@@ -41,7 +41,6 @@ pub(super) struct Outbox {
     queue: VecDeque<Vec<u8>>,
     /// `None` if the session has no socket yet.
     socket: Option<DirectSocket>,
-    /// A transmission was accepted and not yet reported.
     is_sent: bool,
     failed: Option<Errno>,
 }
@@ -55,7 +54,6 @@ impl Outbox {
         self.socket = Some(socket);
     }
 
-    /// Disables direct writes.
     pub(super) fn close(&mut self) {
         self.socket = None;
     }

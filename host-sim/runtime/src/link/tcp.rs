@@ -23,7 +23,6 @@ use recipe_io::fairness::yield_fairly;
 use recipe_io::tcp_options;
 
 impl LinkTask<'_> {
-    /// Connects to the controller's server.
     pub(super) async fn connect_tcp(
         &self,
         session: LinkSession,
@@ -256,7 +255,6 @@ const ACK_POLL: Duration = Duration::from_millis(10);
 /// After this time without acknowledgement the system itself ends the connection, in case this process
 /// cannot.
 const USER_TIMEOUT: Duration = Duration::from_secs(2);
-/// Maximum number of bytes per read.
 const CHUNK: usize = 2_048;
 /// Time without missing acknowledgements after which the system's time limit is removed: long before the first keepalive
 /// probe, with which it must not meet.

@@ -120,7 +120,6 @@ impl LinkTask<'_> {
     }
 }
 
-/// The controller's client of a listening socket.
 struct UdpPeer<'a> {
     /// The sender of the newest frame, which gets the answers. Other datagrams do not change it.
     peer: SocketAddr,

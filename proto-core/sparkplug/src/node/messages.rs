@@ -69,7 +69,6 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         out.finish()
     }
 
-    /// The death of a device.
     pub(super) fn write_device_death<'b>(
         &mut self,
         now: Instant,
@@ -88,7 +87,6 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         out.finish()
     }
 
-    /// The next piece of a birth.
     pub(super) fn write_birth<'b>(
         &mut self,
         now: Instant,

@@ -96,7 +96,6 @@ pub(crate) struct Connect {
     pub(crate) login: Option<(String, String)>,
 }
 
-/// A publication.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Message {
     pub(crate) topic: String,
@@ -122,7 +121,6 @@ pub(crate) struct Told {
     pub(crate) is_historical: bool,
     pub(crate) is_null: bool,
     pub(crate) properties: BTreeMap<String, String>,
-    /// As text.
     pub(crate) value: Option<String>,
 }
 
@@ -199,7 +197,6 @@ impl Rig {
         self.handle(Input::Bytes(bytes));
     }
 
-    /// Up to CONNACK.
     pub(crate) fn connect(&mut self) -> Connect {
         self.now = self.now.max(self.until);
         assert_eq!(self.drain(), [Did::Open]);

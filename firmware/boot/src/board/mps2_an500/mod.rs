@@ -52,7 +52,6 @@ pub(crate) unsafe fn stores() -> Option<(Area, Option<Area>)> {
     Some((store, None))
 }
 
-/// Writes a line to the log.
 pub(crate) fn say(line: fmt::Arguments<'_>) {
     console::print(format_args!("loader: {line}\r\n"));
 }
@@ -100,5 +99,4 @@ pub(crate) fn nothing_runs() -> ! {
 /// The arguments with the names of the files. The firmware has them too.
 const STORE: usize = 3;
 const SLOTS: usize = 5;
-/// Sectors of the store.
 const STORE_SECTORS: u8 = 2;

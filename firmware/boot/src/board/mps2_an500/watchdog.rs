@@ -23,7 +23,6 @@ pub(crate) fn start() {
     write(LOCK, 0);
 }
 
-/// Restarts the timeout.
 pub(crate) fn feed() {
     write(LOCK, UNLOCK);
     write(INTCLEAR, 1);

@@ -148,5 +148,4 @@ const ERASE_SECTOR: u32 = 1 << 2;
 /// 64 bits at a time: the supply is 3.3 V.
 const FASTEST: u32 = 3 << 4;
 const BEGIN: u32 = 1 << 7;
-/// BSY and QW.
 const BUSY: u32 = 1 | 1 << 2;

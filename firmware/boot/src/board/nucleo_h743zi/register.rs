@@ -1,6 +1,5 @@
 //! Registers of the chip by address: the loader needs few of them.
 
-/// A 32-bit register.
 #[derive(Clone, Copy)]
 pub(crate) struct Register(usize);
 

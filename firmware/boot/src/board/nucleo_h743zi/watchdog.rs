@@ -33,7 +33,6 @@ pub(crate) fn start() {
     feed();
 }
 
-/// Restarts the timeout.
 pub(crate) fn feed() {
     KEY.write(FEED);
 }

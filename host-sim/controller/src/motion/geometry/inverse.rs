@@ -29,7 +29,6 @@ impl Way {
 }
 
 impl Branch {
-    /// All of them.
     pub(in crate::motion) fn all() -> impl Iterator<Item = Self> {
         let ways = [Way::One, Way::Other];
         let pairs = ways.into_iter().flat_map(move |shoulder| ways.map(|elbow| (shoulder, elbow)));
