@@ -22,9 +22,9 @@ const COILS_READ: usize = COILS as usize - 1;
 
 fn main() -> ExitCode {
     let works = [
-        Work { name: "read 118 registers", limit: Some(350), run: |n| repeat(n, &mut Exchange::read) },
+        Work { name: "read 118 registers", limit: Some(380), run: |n| repeat(n, &mut Exchange::read) },
         Work { name: "read 118 registers, bare copy", limit: None, run: |n| repeat(n, &mut Bare::read) },
-        Work { name: "write 16 coils", limit: Some(240), run: |n| repeat(n, &mut Exchange::write) },
+        Work { name: "write 16 coils", limit: Some(280), run: |n| repeat(n, &mut Exchange::write) },
         Work { name: "write 16 coils, bare copy", limit: None, run: |n| repeat(n, &mut Bare::write) },
         Work { name: "read 231 coils", limit: Some(1160), run: |n| repeat(n, &mut Exchange::read_coils) },
         Work {

@@ -33,13 +33,11 @@ impl Histogram {
     }
 
     /// Adds a sample.
-    #[inline]
     pub fn record(&mut self, duration: Duration) {
         self.record_micros(u32::try_from(duration.as_micros()).unwrap_or(u32::MAX));
     }
 
     /// Adds a sample of this many microseconds.
-    #[inline]
     pub(crate) fn record_micros(&mut self, micros: u32) {
         let bits = u32::BITS.saturating_sub(micros.leading_zeros()) as usize;
         if let Some(count) = self.counts.get_mut(bits.min(BUCKETS - 1)) {

@@ -55,7 +55,6 @@ impl Stamp {
     }
 
     /// This instant, if it is earlier.
-    #[inline]
     pub(crate) const fn or_earlier(&mut self, instant: Instant) {
         if !instant.0 > self.0 {
             self.0 = !instant.0;

@@ -267,7 +267,6 @@ impl Exchange {
         (0..3).filter_map(move |nth| self.frame(part, nth))
     }
 
-    #[inline(never)]
     fn frame(&self, part: Direction, nth: u8) -> Option<u8> {
         let Transaction::Frames { request, reply, refusal } = self.transaction else { return None };
         match (part, nth) {

@@ -42,7 +42,6 @@ impl<'c> Frames<'c> {
         self.of
     }
 
-    #[inline(never)]
     fn of_exchanges(&mut self) -> Option<Span> {
         if let Some(span) = self.others.iter_mut().find_map(Option::take) {
             self.of = self.of.map(|(exchange, _)| (exchange, false));

@@ -217,7 +217,6 @@ impl Framer {
         *chunk = rest;
     }
 
-    #[cold]
     fn move_to_front(&mut self) {
         let start = usize::from(self.start);
         let held = usize::from(self.end).saturating_sub(start);

@@ -71,25 +71,21 @@ impl Clock {
 
 impl Clock {
     /// Whether an input at `now` finds the engine asleep, and no deadline or beat has come.
-    #[inline(always)]
     pub(super) fn is_idle(&self, now: Instant) -> bool {
         now >= self.now && now < self.idle_until
     }
 
     /// The same of an engine without ports, too, which is not called at every beat.
-    #[inline(always)]
     pub(super) fn is_asleep(&self, now: Instant) -> bool {
         self.is_idle(now) && now < self.beat_at
     }
 
     /// Whether a call at `now` finds nothing to do, and the timer is right.
-    #[inline(always)]
     pub(super) fn is_quiet(&self, now: Instant) -> bool {
         self.dirty == Dirty::ARMED && now.max(self.now) < self.timer_at
     }
 
     /// A tick came before anything was due: the engine sleeps on, as long as it may by now.
-    #[inline(always)]
     pub(super) fn announce_anew(&mut self, has_ports: bool) {
         let until = self.next_call(has_ports);
         (self.announced, self.idle_until) = (until, until);
@@ -104,7 +100,6 @@ impl Clock {
     }
 
     /// The next deadline or beat; the timer is right.
-    #[inline(always)]
     fn next_call(&self, has_ports: bool) -> Instant {
         if !has_ports {
             return self.timer_at;
@@ -113,7 +108,6 @@ impl Clock {
     }
 
     /// Until the next deadline or beat; the timer is right.
-    #[inline(always)]
     pub(super) fn sleep<'b>(&mut self, has_ports: bool) -> Output<'b> {
         let until = self.next_call(has_ports);
         if until == Instant::NEVER {
@@ -132,7 +126,6 @@ impl Clock {
         if now < self.now || now > LAST { self.clamped(now) } else { now }
     }
 
-    #[cold]
     fn clamped(&self, now: Instant) -> Instant {
         now.min(LAST).max(self.now)
     }
@@ -163,25 +156,21 @@ impl Dirty {
     pub(super) const ALL: Self = Self(Self::LINKS.0 | 2 | 4);
 
     /// Whether it is to be asked.
-    #[inline(always)]
     pub(super) const fn has(self, what: Self) -> bool {
         self.0 & what.0 != 0
     }
 
     /// It is to be asked, too.
-    #[inline(always)]
     pub(super) const fn add(&mut self, what: Self) {
         self.0 |= what.0;
     }
 
     /// It was asked.
-    #[inline(always)]
     pub(super) const fn remove(&mut self, what: Self) {
         self.0 &= !what.0;
     }
 
     /// The same, if it is.
-    #[inline(always)]
     pub(super) const fn when(self, wanted: bool) -> Self {
         if wanted { self } else { Self::NONE }
     }

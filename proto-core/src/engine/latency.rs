@@ -27,7 +27,6 @@ impl Since {
     }
 
     /// Something else waits from now on; what waits already is older.
-    #[inline]
     pub(super) fn or_at(&mut self, now: Instant) {
         if !self.is_some() {
             *self = Self::at(now);
@@ -40,7 +39,6 @@ impl Since {
     }
 
     /// The wait is over: records it, if there was one.
-    #[inline]
     pub(super) fn record(self, now: Instant, histogram: &mut Histogram) {
         if self.is_some() {
             histogram.record_micros(self.micros_until(now));

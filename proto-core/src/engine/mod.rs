@@ -181,7 +181,6 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     }
 
     /// Out of line: a run loop would hold the stack of an empty store for ever.
-    #[inline(never)]
     fn clear(&mut self) {
         // A tap that listens continues.
         self.store = Store::new(Vec::new());
@@ -235,7 +234,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// Inputs for a port or link that the configuration does not have are ignored.
     ///
     /// The answer spares a driver [`Self::poll_output`] where nothing comes of an input; it may be ignored.
-    // A frame byte by byte to UDP takes 4923 instructions if this is out of line, and 4378 inline.
+    // A frame byte by byte to UDP takes 4923 instructions if this is out of line, and 4282 inline.
     #[inline(always)]
     pub fn handle(&mut self, now: Instant, input: Input<'_>) -> Handled {
         let handled = match input {

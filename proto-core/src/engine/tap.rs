@@ -111,7 +111,6 @@ impl<R: ?Sized> Tap<R> {
 
 impl Tap {
     /// Keeps a record if the tap listens.
-    #[inline]
     pub(super) fn record<'a>(&mut self, what: impl FnOnce() -> Tapped<'a>) {
         if self.is_listening {
             self.keep(&what());
@@ -119,14 +118,12 @@ impl Tap {
     }
 
     /// Data is handed over for sending.
-    #[inline]
     pub(super) fn went(&mut self, place: TapPlace, can_id: Option<CanId>, bytes: &[u8], at: Instant) {
         let (direction, verdict) = (TapDirection::Out, TapVerdict::Taken);
         self.record(|| Tapped { at, place, direction, verdict, can_id, pieces: [bytes, &[], &[]] });
     }
 
     /// Bytes, or a datagram, came on a link.
-    #[inline]
     pub(super) fn came(&mut self, link: LinkId, bytes: &[u8], at: Instant) {
         let (place, direction, verdict) = (TapPlace::Link(link), TapDirection::In, TapVerdict::Link);
         self.record(|| Tapped { at, place, direction, verdict, can_id: None, pieces: [bytes, &[], &[]] });
@@ -174,8 +171,6 @@ impl Tap {
         })
     }
 
-    #[cold]
-    #[inline(never)]
     fn keep(&mut self, what: &Tapped<'_>) {
         let len = what.pieces.iter().fold(0_usize, |len, piece| len.saturating_add(piece.len()));
         let kept = len.min(MAX_TAPPED);

@@ -146,7 +146,6 @@ impl Image {
 
     /// Sets the variable to the value that its source just sent; an unreadable value makes the
     /// variable unknown until a readable one comes. Returns whether the value was readable.
-    #[inline]
     pub(crate) fn receive(&mut self, var: SysVar, value: Scalar) -> bool {
         let readable = self.set(var, value).is_ok();
         if !readable || self.any_unreadable {
@@ -155,7 +154,6 @@ impl Image {
         readable
     }
 
-    #[cold]
     fn note_readable(&mut self, var: SysVar, readable: bool) {
         if readable {
             self.all_readable(core::iter::once(var));

@@ -88,14 +88,11 @@ impl InputSet {
     }
 
     /// The same where the run may go on in the next word.
-    #[cold]
-    #[inline(never)]
     fn long_run_len(&self, ordinal: usize) -> usize {
         self.bits().checked_shr(ordinal as u32).map_or(0, |bits| bits.trailing_ones() as usize)
     }
 
     /// The `len` variables from `first` on, without those that are not inputs.
-    #[inline]
     pub(crate) fn run(first: SysVar, len: usize) -> Self {
         let (nth, within) = (first.ordinal() / 32, first.ordinal() % 32);
         // Most runs lie in one word.
@@ -108,7 +105,6 @@ impl InputSet {
     }
 
     /// The same, wherever they are.
-    #[inline(never)]
     fn long_run(first: SysVar, len: usize) -> Self {
         let end = first.ordinal().saturating_add(len).min(INPUT_COUNT);
         Self::from(first.ordinal()).minus(&Self::from(end))
@@ -125,7 +121,6 @@ impl InputSet {
     }
 
     /// The first variable of the set at or behind this place of the table, or else the first of all.
-    #[inline]
     pub(crate) fn first_from(&self, ordinal: usize) -> Option<SysVar> {
         // Mostly it is near.
         let behind = self.0.get(ordinal / 32).map_or(0, |word| word >> (ordinal % 32));
@@ -142,7 +137,6 @@ impl InputSet {
     }
 
     /// The first variable in table order.
-    #[inline]
     pub(crate) fn first(&self) -> Option<SysVar> {
         let (nth, word) = match self.0 {
             [0, 0, word] => (64_usize, word),

@@ -222,7 +222,6 @@ impl Supervisor {
     }
 
     /// When to call [`Self::advance`], after [`Self::take_action`].
-    #[inline]
     pub(crate) fn deadline(&self) -> Instant {
         match self.state {
             LinkState::Down { retry_at } => retry_at,
@@ -232,7 +231,6 @@ impl Supervisor {
         }
     }
 
-    #[inline]
     fn silent_at(&self) -> Instant {
         self.timings.silence.map_or(Instant::NEVER, |silence| self.heard + silence)
     }

@@ -134,7 +134,6 @@ impl AduReader {
 
     /// Takes a frame that lies whole at the front of `chunk`. `None`, with nothing taken, if
     /// [`Self::next_buffered`] has to look at what is there.
-    #[inline]
     pub(super) fn take<'c>(&self, chunk: &mut &'c [u8]) -> Option<AduFrame<'c>> {
         let (front, behind) = chunk.split_first_chunk().filter(|_| self.filled == 0)?;
         let front = Front::from_bytes(front);
@@ -145,8 +144,6 @@ impl AduReader {
 
     /// Takes what a frame in pieces needs, and returns the front of the one that is whole then; its data is
     /// [`Self::data`]. A header that is wrong comes here too.
-    #[cold]
-    #[inline(never)]
     pub(super) fn next_buffered(&mut self, chunk: &mut &[u8]) -> Option<Result<Front, AduError>> {
         // As most chunks end.
         if chunk.is_empty() || !self.fill_to(PREFIX_LEN, chunk) {
@@ -193,19 +190,16 @@ impl Front {
     }
 
     /// The same of the next frame to that unit, with a function code and without a length.
-    #[inline]
     pub(super) const fn next(self, function: u8) -> Self {
         Self((self.0 & (TRANSACTION | UNIT)).wrapping_add(1 << TRANSACTION_SHIFT) | function as u64)
     }
 
     /// This front, of a frame with `had` bytes behind the function code, of one with `data_len` bytes there.
-    #[inline]
     pub(super) const fn resized(self, had: usize, data_len: usize) -> Self {
         Self(self.0.wrapping_add((data_len as u64).wrapping_sub(had as u64) << LENGTH_SHIFT))
     }
 
     /// This front, which is without a length, of a frame with `data_len` bytes behind the function code.
-    #[inline]
     pub(super) const fn carrying(self, data_len: usize) -> Self {
         Self(self.0 | ((data_len as u16).wrapping_add(NO_DATA) as u64) << LENGTH_SHIFT)
     }
@@ -215,39 +209,32 @@ impl Front {
         Self(self.0 & !FUNCTION | function as u64)
     }
 
-    #[inline]
     pub(super) const fn from_bytes(bytes: &[u8; FRONT_LEN]) -> Self {
         Self(u64::from_be_bytes(*bytes))
     }
 
-    #[inline]
     pub(super) const fn to_bytes(self) -> [u8; FRONT_LEN] {
         self.0.to_be_bytes()
     }
 
-    #[inline]
     pub(super) const fn transaction(self) -> u16 {
         (self.0 >> TRANSACTION_SHIFT) as u16
     }
 
-    #[inline]
     pub(super) const fn unit(self) -> u8 {
         (self.0 >> UNIT_SHIFT) as u8
     }
 
-    #[inline]
     pub(super) const fn function(self) -> u8 {
         self.0 as u8
     }
 
     /// Number of bytes behind the function code, of a front whose header is right.
-    #[inline]
     pub(super) const fn data_len(self) -> usize {
         ((self.0 >> LENGTH_SHIFT) as u16).wrapping_sub(NO_DATA) as usize
     }
 
     /// The same; `None` if the header is wrong.
-    #[inline]
     fn checked_data_len(self) -> Option<usize> {
         // Protocol id and length together: the id has to be 0.
         let length = (self.0 >> LENGTH_SHIFT) as u32;
@@ -257,7 +244,6 @@ impl Front {
 }
 
 /// The length of the whole frame, from the first six bytes of its header.
-#[inline]
 pub(crate) fn frame_len(&[_, _, p1, p0, l1, l0]: &[u8; PREFIX_LEN]) -> Result<usize, AduError> {
     let protocol = u16::from_be_bytes([p1, p0]);
     if protocol != 0 {

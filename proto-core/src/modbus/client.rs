@@ -135,7 +135,6 @@ impl Client {
     /// # Errors
     /// Nothing was written and nothing changed: a request is in flight, the count is outside the
     /// function's limits, or `out` is too short (260 bytes are always enough).
-    #[inline]
     pub fn start(&mut self, request: Request<'_>, out: &mut [u8]) -> Result<usize, StartError> {
         if self.in_flight {
             return Err(StartError::Busy);
@@ -166,7 +165,6 @@ impl Client {
     }
 
     /// Writes what a request's frame has before its data, and waits for the answer.
-    #[inline]
     fn begin(
         &mut self,
         parts: &RequestParts<'_>,
@@ -189,7 +187,6 @@ impl Client {
 
     /// Takes bytes from the front of `bytes` up to the end of the next answer and returns what it
     /// says; `None` once all of `bytes` is taken. To be called until then.
-    #[inline]
     pub fn receive<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
         match self.take_answer(bytes) {
             Some(response) => Some(ClientEvent::Response(response)),
@@ -201,7 +198,6 @@ impl Client {
 
     /// Takes the one answer that is expected, whole and at the front of the chunk. `None`, with nothing taken, if
     /// [`Self::receive_other`] has to look closer.
-    #[inline]
     fn take_answer<'c>(&mut self, bytes: &mut &'c [u8]) -> Option<Response<'c>> {
         if !self.in_flight {
             return None;
@@ -218,7 +214,6 @@ impl Client {
     }
 
     /// The same for anything else that may come: answers in pieces, refusals, late answers, violations.
-    #[inline(never)]
     fn receive_other<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
         let newest = self.answer.transaction();
         loop {
@@ -266,7 +261,6 @@ impl Client {
         self.reader.reset();
     }
 
-    #[cold]
     fn violated<'s>(&mut self, bytes: &mut &[u8], violation: Violation) -> ClientEvent<'s> {
         self.reset();
         *bytes = &[];

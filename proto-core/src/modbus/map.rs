@@ -63,7 +63,6 @@ impl MapRun {
 ///
 /// # Errors
 /// [`Exception::IllegalDataAddress`] if one of them is outside the map.
-#[inline]
 pub fn check_read(space: Space, address: u16, count: u16) -> Result<(), Exception> {
     let end = match space {
         Space::Coils => COILS,
@@ -77,7 +76,6 @@ pub fn check_read(space: Space, address: u16, count: u16) -> Result<(), Exceptio
 ///
 /// # Errors
 /// [`Exception::IllegalDataAddress`] if one of them is outside the map or read-only.
-#[inline]
 pub fn check_write(space: Space, address: u16, count: u16) -> Result<(), Exception> {
     let run_end = match space {
         Space::Coils => COIL_RUNS.get(usize::from(address)),
@@ -92,7 +90,6 @@ pub fn check_write(space: Space, address: u16, count: u16) -> Result<(), Excepti
 
 /// `value` as a register of `per_unit` counts per unit: rounded to the nearest count, two's
 /// complement, saturated at ±32767, and 0 for a value that is not a number (D11).
-#[inline]
 pub fn scaled(value: f32, per_unit: u16) -> u16 {
     let counts = f64::from(value) * f64::from(per_unit);
     // The cast takes infinities to the ends of i32 and NaN to 0.
@@ -101,7 +98,6 @@ pub fn scaled(value: f32, per_unit: u16) -> u16 {
 }
 
 /// The value of a register of `per_unit` counts per unit.
-#[inline]
 pub fn unscaled(register: u16, per_unit: u16) -> f32 {
     f32::from(register as i16) / f32::from(per_unit.max(1))
 }

@@ -57,33 +57,27 @@ impl core::error::Error for PduEncodeError {}
 pub(super) struct Operands(u32);
 
 impl Operands {
-    #[inline]
     pub(super) const fn new(address: u16, count_or_value: u16) -> Self {
         Self((address as u32) << 16 | count_or_value as u32)
     }
 
-    #[inline]
     pub(super) const fn from_bytes(bytes: &[u8; OPERANDS_LEN]) -> Self {
         Self(u32::from_be_bytes(*bytes))
     }
 
-    #[inline]
     pub(super) const fn to_bytes(self) -> [u8; OPERANDS_LEN] {
         self.0.to_be_bytes()
     }
 
-    #[inline]
     pub(super) const fn address(self) -> u16 {
         (self.0 >> 16) as u16
     }
 
-    #[inline]
     pub(super) const fn count_or_value(self) -> u16 {
         self.0 as u16
     }
 
     /// The head of a request of `function`.
-    #[inline]
     pub(super) const fn of(self, function: u8) -> RequestHead {
         RequestHead { function, address: self.address(), count_or_value: self.count_or_value() }
     }
@@ -104,20 +98,17 @@ pub(super) struct RequestParts<'a> {
 
 impl RequestParts<'_> {
     /// The parts of a request without data, whose answer has its operands.
-    #[inline]
     pub(super) const fn new(function: u8, address: u16, count_or_value: u16, max: u16) -> Self {
         let operands = Operands::new(address, count_or_value);
         Self { function, operands, max, data: None, answer_len: OPERANDS_LEN }
     }
 
     /// Number of bytes behind the function code.
-    #[inline]
     pub(super) fn data_len(&self) -> usize {
         self.data.map_or(OPERANDS_LEN, |(data, _)| data.len().wrapping_add(OPERANDS_LEN + 1))
     }
 
     /// Refuses a count that the function does not allow.
-    #[inline]
     pub(super) fn check_count(&self) -> Result<(), PduEncodeError> {
         let (count, max) = (self.operands.count_or_value(), self.max);
         if max == NO_COUNT || in_limit(count, max) {
@@ -128,7 +119,6 @@ impl RequestParts<'_> {
     }
 
     /// Writes what comes behind the function code to `out`, which is [`Self::data_len`] bytes long.
-    #[inline]
     pub(super) fn write(&self, out: &mut [u8]) {
         let Some((operands, rest)) = out.split_first_chunk_mut() else { return };
         *operands = self.operands.to_bytes();
@@ -141,12 +131,10 @@ impl RequestParts<'_> {
         }
     }
 
-    #[inline]
     pub(super) fn encoded_len(&self) -> usize {
         self.data_len().saturating_add(1)
     }
 
-    #[inline]
     pub(super) fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         self.check_count()?;
         let (needed, available) = (self.encoded_len(), out.len());
@@ -160,7 +148,6 @@ impl RequestParts<'_> {
 }
 
 /// Copies `data` to `target`, which is as long, and clears the highest `unused` bits, at most 7, of its last byte.
-#[inline]
 pub(super) fn copy_cleared(data: &[u8], unused: u8, target: &mut [u8]) {
     match (&mut *target, data) {
         // Sixteen digital outputs, or one register.
@@ -177,12 +164,10 @@ pub(super) fn copy_cleared(data: &[u8], unused: u8, target: &mut [u8]) {
     }
 }
 
-#[inline]
 pub(super) const fn in_limit(count: u16, max: u16) -> bool {
     count != 0 && count <= max
 }
 
-#[inline]
 pub(super) const fn coil_value(on: bool) -> u16 {
     if on { COIL_ON } else { COIL_OFF }
 }

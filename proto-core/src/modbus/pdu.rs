@@ -197,7 +197,6 @@ impl<'a> Request<'a> {
     /// The exception to answer with: 01 for another function code, 03 for a count of 0 or over the
     /// limit, an FC 5 value other than 0x0000 and 0xFF00, or a PDU whose length disagrees with its
     /// function or byte count.
-    #[inline]
     pub fn parse(pdu: &'a [u8]) -> Result<Self, Exception> {
         let (&function, data) = pdu.split_first().ok_or(Exception::IllegalFunction)?;
         let Some((operands, rest)) = data.split_first_chunk() else { return Err(refusal(function)) };
@@ -236,14 +235,12 @@ impl<'a> Request<'a> {
     }
 
     /// Function code, address, and count or value.
-    #[inline]
     pub fn head(&self) -> RequestHead {
         let parts = self.parts();
         parts.operands.of(parts.function)
     }
 
     /// Length of the request's PDU; 5..=252 for a request that can be sent.
-    #[inline]
     pub fn encoded_len(&self) -> usize {
         self.parts().encoded_len()
     }
@@ -252,12 +249,10 @@ impl<'a> Request<'a> {
     ///
     /// # Errors
     /// A count the function does not allow, or too little space; nothing is written then.
-    #[inline]
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         self.parts().encode(out)
     }
 
-    #[inline]
     pub(super) fn parts(&self) -> RequestParts<'a> {
         let single = RequestParts::new;
         match *self {
@@ -290,7 +285,6 @@ impl<'a> Request<'a> {
 impl<'a> Response<'a> {
     /// The answer to a request of `function` that was carried out; `data` is what comes behind its
     /// function code, of the length that the request asks for. `None` if it is not exactly that.
-    #[inline]
     pub(super) fn expected(function: u8, operands: Operands, data: &'a [u8]) -> Option<Self> {
         let (address, count_or_value) = (operands.address(), operands.count_or_value());
         // By ranges, so that one comparison tells reads from writes: it is a function that a request can have.
@@ -317,7 +311,6 @@ impl<'a> Response<'a> {
     ///
     /// # Errors
     /// [`ResponseError`] when the bytes do not answer that request.
-    #[inline]
     pub fn parse(request: RequestHead, pdu: &'a [u8]) -> Result<Result<Self, Exception>, ResponseError> {
         match pdu.split_first() {
             Some((&received, data)) => Self::parse_data(request, received, data),
@@ -412,7 +405,6 @@ impl<'a> Response<'a> {
 }
 
 impl RequestHead {
-    #[inline]
     pub(super) const fn to_bytes(self) -> [u8; HEAD_LEN] {
         let ([a1, a0], [c1, c0]) = (self.address.to_be_bytes(), self.count_or_value.to_be_bytes());
         [self.function, a1, a0, c1, c0]
@@ -425,12 +417,10 @@ pub fn exception_pdu(function: u8, exception: Exception) -> [u8; 2] {
 }
 
 /// An echo of another length; a read of nothing or of too much, which no request asks for, has no answer at all.
-#[cold]
 fn unanswerable(data: &[u8]) -> ResponseError {
     ResponseError::Length { expected: HEAD_LEN, received: data.len().saturating_add(1) }
 }
 
-#[cold]
 fn parse_exception(function: u8, received: u8, data: &[u8]) -> Result<Exception, ResponseError> {
     match data {
         _ if received != function | function::EXCEPTION_FLAG => {
@@ -442,7 +432,6 @@ fn parse_exception(function: u8, received: u8, data: &[u8]) -> Result<Exception,
 }
 
 /// The data of a read's answer, `data` being everything after the function code.
-#[inline]
 fn counted(data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
     match data.split_first() {
         Some((byte_count, _)) if usize::from(*byte_count) != expected => {
@@ -457,8 +446,6 @@ fn counted(data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
 }
 
 /// What a server answers to a request that cannot be parsed: 03 when it knows the function.
-#[cold]
-#[inline(never)]
 pub(super) fn refusal(function: u8) -> Exception {
     match function {
         function::READ_COILS

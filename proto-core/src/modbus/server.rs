@@ -88,7 +88,6 @@ impl Server {
     ///
     /// # Errors
     /// The connection must be closed (D10); the rest of its bytes is dropped.
-    #[inline]
     pub fn receive<B: RegisterBank + ?Sized>(
         &mut self,
         bytes: &mut &[u8],
@@ -124,7 +123,6 @@ impl Server {
 /// Carries out the request in `pdu`, writes the answer's PDU to `out` and returns its length.
 ///
 /// For other framings of PDUs; [`Server`] calls it for each frame.
-#[inline]
 pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8; MAX_PDU]) -> usize {
     let (&asked, data) = pdu.split_first().unwrap_or((&0, &[]));
     let Some((function, body)) = out.split_first_mut() else { return 0 };
@@ -147,8 +145,6 @@ struct ResponseStart {
 type ResponseBody = [u8; MAX_PDU - 1];
 
 /// Another function, or an exception.
-#[cold]
-#[inline(never)]
 fn others<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
@@ -221,7 +217,6 @@ fn read_inputs<B: RegisterBank + ?Sized>(
 /// answer's. Returns how much that is.
 // Without a value that can be any request: it would be written and taken apart again. What a request must have is asked
 // by its length first, because that is known to be right for both reads and for both writes then.
-#[inline]
 fn carry_out<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
@@ -261,7 +256,6 @@ fn carry_out<B: RegisterBank + ?Sized>(
 }
 
 /// FC 5 and 6.
-#[inline(never)]
 fn write_one<B: RegisterBank + ?Sized>(
     function: u8,
     operands: Operands,
@@ -282,7 +276,6 @@ fn write_one<B: RegisterBank + ?Sized>(
 }
 
 /// Byte count and packed bits of an answer; returns how many bytes that is. `read` gets them cleared.
-#[inline]
 fn read_bits(
     out: &mut ResponseBody,
     count: u16,
@@ -298,7 +291,6 @@ fn read_bits(
 }
 
 /// The same for registers.
-#[inline]
 fn read_words(
     out: &mut ResponseBody,
     count: u16,
@@ -310,7 +302,6 @@ fn read_words(
 }
 
 /// The byte count of a read's answer; returns the place for the data.
-#[inline]
 fn read_answer(out: &mut ResponseBody, len: usize) -> Result<&mut [u8], Exception> {
     let (byte_count, data) = out.split_first_mut().ok_or(Exception::DeviceFailure)?;
     // At most 250 bytes by the limits of the count.
@@ -319,7 +310,6 @@ fn read_answer(out: &mut ResponseBody, len: usize) -> Result<&mut [u8], Exceptio
 }
 
 /// Addresses are 16 bits: a run beyond the last one is outside every map.
-#[inline]
 fn check_end(address: u16, count: u16) -> Result<(), Exception> {
     let end = u32::from(address).wrapping_add(u32::from(count));
     if end <= ADDRESSES { Ok(()) } else { Err(Exception::IllegalDataAddress) }

@@ -19,7 +19,6 @@ pub struct Coils<'a> {
 impl<'a> Coils<'a> {
     /// The first `count` coils of `packed`; `None` when `count` is 0 or over 2000, or `packed` is too
     /// short.
-    #[inline]
     pub fn new(packed: &'a [u8], count: u16) -> Option<Self> {
         if count == 0 || count > MAX_READ_COILS {
             return None;
@@ -28,7 +27,6 @@ impl<'a> Coils<'a> {
     }
 
     /// The `count` coils that `packed` holds, in exactly as many bytes as they take.
-    #[inline]
     pub(super) fn exact(packed: &'a [u8], count: u16) -> Option<Self> {
         let fits = count != 0 && count <= MAX_READ_COILS && packed.len() == packed_len(count);
         fits.then_some(Self { packed, count })
@@ -36,7 +34,6 @@ impl<'a> Coils<'a> {
 
     /// The `count` coils of an answer, in exactly as many bytes as they take. Both were checked by whoever sent the
     /// request, and its answer's length.
-    #[inline]
     pub(super) const fn of_request(packed: &'a [u8], count: u16) -> Self {
         Self { packed, count }
     }
@@ -60,13 +57,11 @@ impl<'a> Coils<'a> {
     }
 
     /// Number of coils, at least 1.
-    #[inline]
     pub const fn count(self) -> u16 {
         self.count
     }
 
     /// Coil `nth`, counted from 0.
-    #[inline]
     pub fn coil(self, nth: u16) -> Option<bool> {
         if nth >= self.count {
             return None;
@@ -81,7 +76,6 @@ impl<'a> Coils<'a> {
 
     /// Up to eight coils from `first` on as one byte, the first in the least significant bit: a
     /// byte variable of the map. `None` if `first` is beyond the last coil.
-    #[inline]
     pub fn byte(self, first: u16) -> Option<u8> {
         let left = self.count.checked_sub(first).filter(|left| *left != 0)?;
         let at = usize::from(first >> 3);
@@ -93,7 +87,6 @@ impl<'a> Coils<'a> {
 
     /// Writes the packed coils to the front of `bytes`, the bits beyond the last one as 0, and returns how many bytes
     /// that are; `None`, with nothing written, if it is too short.
-    #[inline]
     pub fn copy_to(self, bytes: &mut [u8]) -> Option<usize> {
         let target = bytes.get_mut(..self.packed.len())?;
         copy_cleared(self.packed, self.unused(), target);
@@ -106,13 +99,11 @@ impl<'a> Coils<'a> {
     }
 
     /// Number of bits of the last packed byte that are no coils: its highest ones.
-    #[inline]
     pub(super) const fn unused(self) -> u8 {
         self.count.wrapping_neg() as u8 & 7
     }
 
     /// The bits of the last packed byte that are coils.
-    #[inline]
     pub const fn last_mask(self) -> u8 {
         last_mask(self.count)
     }
@@ -142,7 +133,6 @@ pub struct Registers<'a> {
 impl<'a> Registers<'a> {
     /// The registers in `bytes`, two big-endian bytes each; `None` when there are none, an odd
     /// number of bytes, or more than 125 registers.
-    #[inline]
     pub const fn new(bytes: &'a [u8]) -> Option<Self> {
         let len = bytes.len();
         if len == 0 || len > MAX_REGISTER_BYTES || !len.is_multiple_of(2) {
@@ -152,14 +142,12 @@ impl<'a> Registers<'a> {
     }
 
     /// The `count` registers that `bytes` holds, in exactly as many bytes as they take.
-    #[inline]
     pub(super) fn exact(bytes: &'a [u8], count: u16) -> Option<Self> {
         let len = usize::from(count).saturating_mul(2);
         (len != 0 && len <= MAX_REGISTER_BYTES && bytes.len() == len).then_some(Self { bytes })
     }
 
     /// The registers of an answer, as many bytes as the request asks for: its sender has checked the count.
-    #[inline]
     pub(super) const fn of_request(bytes: &'a [u8]) -> Self {
         Self { bytes }
     }
@@ -203,7 +191,6 @@ impl<'a> Registers<'a> {
     }
 
     /// Writes the registers to the front of `words`, as many as fit, and returns how many.
-    #[inline]
     pub fn copy_to(self, words: &mut [u16]) -> usize {
         let registers = self.bytes.as_chunks::<2>().0;
         let count = registers.len().min(words.len());
@@ -223,7 +210,6 @@ impl<'a> Registers<'a> {
 /// Turns as many registers as there are words.
 // Pieces of a fixed size are vector operations without a loop for what is left over: the last words are turned together
 // with some that are turned anyway.
-#[inline]
 fn turn(registers: &[[u8; 2]], words: &mut [u16]) {
     let (Some(last), true) = (registers.last_chunk(), registers.len() == words.len()) else {
         return registers.iter().zip(words).for_each(|(from, to)| *to = u16::from_be_bytes(*from));
@@ -242,7 +228,6 @@ fn turn(registers: &[[u8; 2]], words: &mut [u16]) {
 }
 
 // All are read before any is written: so they need not be known to lie apart.
-#[inline(always)]
 fn turn_piece<const N: usize>(registers: &[[u8; 2]; N], words: &mut [u16; N]) {
     *words = registers.map(u16::from_be_bytes);
 }
@@ -252,13 +237,11 @@ const HALF: usize = 8;
 const PIECE: usize = 16;
 
 /// Bytes that `count` packed coils take.
-#[inline]
 pub(super) const fn packed_len(count: u16) -> usize {
     count.div_ceil(8) as usize
 }
 
 /// The bits of the last packed byte of `count` coils that are coils.
-#[inline]
 pub(super) const fn last_mask(count: u16) -> u8 {
     // As many bits are unused as are missing to the next multiple of 8.
     0xFF_u8 >> (count.wrapping_neg() & 7)

@@ -135,7 +135,6 @@ impl CanLayout {
     }
 
     /// The frame with this index in the part.
-    #[inline]
     pub fn frame(&self, index: usize) -> Option<CanFrameLayout<'_>> {
         let share = self.shares.get(index)?;
         let key = self.keys.get(index).copied().unwrap_or(CanKey::NONE);
@@ -191,6 +190,7 @@ impl CanLayout {
 
     /// The index of the frame with this id. At least half of the places are empty, so the search is
     /// short.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[inline]
     fn index_of(&self, key: CanKey) -> Option<usize> {
         let first = self.search_order(key).next()?;
@@ -199,7 +199,6 @@ impl CanLayout {
     }
 
     /// The same, when there is another frame at its first choice.
-    #[inline(never)]
     fn index_behind(&self, key: CanKey) -> Option<usize> {
         for at in self.search_order(key) {
             let index = usize::from(*self.places.get(at)?);
@@ -212,7 +211,6 @@ impl CanLayout {
     }
 
     /// The places of a key, first choice first.
-    #[inline]
     fn search_order(&self, key: CanKey) -> impl Iterator<Item = usize> + use<> {
         let first = (key.number().wrapping_mul(SPREAD) >> PLACE_SHIFT) as usize;
         (0..PLACES).map(move |further| first.wrapping_add(further) % PLACES)
@@ -299,7 +297,6 @@ impl<'a> CanFrameLayout<'a> {
         self.layout.shares.get(self.index.saturating_add(1))
     }
 
-    #[inline(never)]
     fn apply_runs(
         layout: &CanLayout,
         index: usize,

@@ -193,6 +193,7 @@ impl FieldRun {
 impl Runs<'_> {
     /// Writes a payload into the image; `None`, with nothing written, if [`FrameFields::check`] has
     /// to look closer.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[inline(never)]
     pub(super) fn apply(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
         if payload.len() != self.len {
@@ -219,7 +220,6 @@ impl Runs<'_> {
     }
 
     /// Fills a payload from the image; user-defined fields have no place there and become zero.
-    #[inline(never)]
     pub(super) fn encode(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
         let mut rest = payload;
         for step in self.steps {
@@ -250,7 +250,6 @@ impl<'a> FrameFields<'a> {
     }
 
     /// Refuses a payload of another length, or with a float or double that is not finite.
-    #[inline(never)]
     pub(super) fn check(self, payload: &[u8]) -> Result<(), ValueError> {
         if payload.len() != self.len {
             return Err(ValueError::Length { expected: self.len, got: payload.len() });
@@ -286,7 +285,6 @@ impl<'a> FrameFields<'a> {
 
 impl FieldRun {
     /// Bytes of the payload.
-    #[inline]
     pub(super) const fn len(&self) -> usize {
         self.len as usize
     }
@@ -319,7 +317,6 @@ impl FieldRun {
     }
 
     /// Fills a payload that is one run from the image; `false`, with nothing written, if it is none.
-    #[inline(always)]
     pub(super) fn encode(&self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) -> bool {
         match image.get(self.range()) {
             Some(source) if payload.len() == source.len() => {
@@ -331,19 +328,16 @@ impl FieldRun {
     }
 
     /// Whether the values of a run may be used.
-    #[inline]
     fn accepts(&self, run: &[u8]) -> bool {
         self.kind != RunContent::FLOATS || runs::all_finite(run)
     }
 
     /// Writes a run to its place in the image, and returns how many of its fields had reserved bits
     /// set.
-    #[inline]
     fn write(&self, run: &[u8], image: &mut [u8; IMAGE_BYTES]) -> u16 {
         image.get_mut(self.range()).map_or(0, |target| self.put(run, target))
     }
 
-    #[inline]
     fn put(&self, run: &[u8], target: &mut [u8]) -> u16 {
         match self.kind {
             RunContent::PLAIN | RunContent::FLOATS => {
@@ -359,14 +353,12 @@ impl FieldRun {
     }
 
     /// Reads a run from its place in the image.
-    #[inline]
     fn read(&self, image: &[u8; IMAGE_BYTES], run: &mut [u8]) {
         if let Some(source) = image.get(self.range()) {
             runs::copy(run, source);
         }
     }
 
-    #[inline]
     fn range(&self) -> core::ops::Range<usize> {
         let start = usize::from(self.image);
         start..start.saturating_add(usize::from(self.len))

@@ -108,6 +108,7 @@ impl StreamLayout {
     ///
     /// # Errors
     /// [`ValueError`]: a float that is not finite, or a payload of another length.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[inline]
     pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
         // Not with the run's length: that a payload of a frame is as long as this one the compiler knows.
@@ -124,7 +125,6 @@ impl StreamLayout {
     ///
     /// # Errors
     /// [`NoSpace`], with nothing written, when `out` is shorter than a frame.
-    #[inline]
     pub fn encode(&self, image: &[u8; IMAGE_BYTES], out: &mut [u8]) -> Result<usize, NoSpace> {
         let payload = self.delimited(out)?;
         if !self.whole.encode(image, payload) {

@@ -106,7 +106,6 @@ impl SysVar {
     }
 
     /// The table row the variable belongs to.
-    #[inline]
     pub fn span(self) -> &'static Span {
         table::span_of(self.ordinal())
     }
@@ -173,19 +172,16 @@ impl SysVar {
     }
 
     /// Number of variables from this one to the last of its row.
-    #[inline]
     pub(crate) fn left_in_row(self) -> usize {
         self.place().left_in_row
     }
 
     /// The variable's place in the Modbus map; inputs can be written and read back there.
-    #[inline]
     pub fn modbus(self) -> Option<ModbusPlace> {
         self.place().modbus
     }
 
     /// Its places, looked up once.
-    #[inline]
     pub(crate) fn place(self) -> VarPlace {
         let (span, nth, image_offset) = table::place_of(self.ordinal());
         // No address is near the end of 16 bits; a test looks at all of them.
@@ -202,7 +198,6 @@ impl SysVar {
         VarPlace { modbus, left_in_row, image_offset }
     }
 
-    #[inline]
     fn place_in_span(self) -> u16 {
         table::place_in_span(self.ordinal())
     }

@@ -50,7 +50,6 @@ impl StateView<'_> {
 
 /// Eight bool bytes as one byte, the first in the least significant bit (D13); what is not 0
 /// counts as 1.
-#[inline]
 fn pack(bools: &[u8; 8]) -> u8 {
     const LOW_SEVEN: u64 = 0x7F7F_7F7F_7F7F_7F7F;
     // Places bit 0 of byte n at bit 56 + n; no two bits meet, so nothing carries.

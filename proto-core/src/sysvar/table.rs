@@ -165,20 +165,17 @@ static PLACES: [(u8, u8, u16); COUNT] = {
 };
 
 /// `ordinal` is below [`COUNT`] in every [`super::SysVar`]; anything else reads the first row.
-#[inline]
 pub(super) fn span_of(ordinal: usize) -> &'static Span {
     let row = PLACES.get(ordinal).map_or(0, |place| usize::from(place.0));
     SPANS.get(row).unwrap_or(&SPANS[0])
 }
 
 /// The row, the place in it, and the offset in the image.
-#[inline]
 pub(super) fn place_of(ordinal: usize) -> (&'static Span, u16, usize) {
     let (row, nth, offset) = PLACES.get(ordinal).copied().unwrap_or_default();
     (SPANS.get(usize::from(row)).unwrap_or(&SPANS[0]), nth.into(), offset.into())
 }
 
-#[inline]
 pub(super) fn place_in_span(ordinal: usize) -> u16 {
     PLACES.get(ordinal).map_or(0, |place| u16::from(place.1))
 }

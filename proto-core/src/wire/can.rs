@@ -45,7 +45,6 @@ impl CanKey {
     /// No id has it.
     pub(crate) const NONE: Self = Self(u32::MAX);
 
-    #[inline]
     pub(crate) const fn of(id: CanId) -> Self {
         match id {
             CanId::Standard(id) => Self(id as u32),
@@ -53,7 +52,6 @@ impl CanKey {
         }
     }
 
-    #[inline]
     pub(crate) const fn id(self) -> CanId {
         if self.0 & EXTENDED == 0 {
             CanId::Standard(self.0 as u16)
@@ -62,7 +60,6 @@ impl CanKey {
         }
     }
 
-    #[inline]
     pub(crate) const fn number(self) -> u32 {
         self.0
     }
@@ -128,7 +125,6 @@ impl CanFrame {
 
     /// A data frame of `len` bytes, which `fill` writes. The caller has checked that the id is
     /// valid and `len` at most [`MAX_CAN_DATA`].
-    #[inline]
     pub(crate) fn filled(id: CanId, len: u8, fill: impl FnOnce(&mut [u8])) -> Self {
         let mut data = [0; MAX_CAN_DATA];
         if let Some(used) = data.get_mut(..usize::from(len)) {
@@ -153,7 +149,6 @@ impl CanFrame {
     }
 
     /// The same in one word.
-    #[inline]
     pub(crate) const fn key(&self) -> CanKey {
         self.key
     }
@@ -164,13 +159,11 @@ impl CanFrame {
     }
 
     /// Number of bytes of data; 0 in a remote frame.
-    #[inline]
     pub(crate) fn len(&self) -> usize {
         self.len as usize
     }
 
     /// The data; empty in a remote frame.
-    #[inline]
     pub fn data(&self) -> &[u8] {
         // There are never more, which the compiler does not know.
         self.data.get(..self.len().min(MAX_CAN_DATA)).unwrap_or(&[])

@@ -8,7 +8,6 @@
 pub(crate) const MAX_RUN: usize = 32;
 
 /// Copies `from`, at most [`MAX_RUN`] bytes, into `to`, which has the same length.
-#[inline]
 pub(crate) fn copy(to: &mut [u8], from: &[u8]) {
     debug_assert!(to.len() == from.len() && from.len() <= MAX_RUN);
     match from.len() {
@@ -23,6 +22,7 @@ pub(crate) fn copy(to: &mut [u8], from: &[u8]) {
 
 /// Copies a piece of any length to one of the same length, by runs: on a Cortex-M half the work of `memcpy`, which
 /// moves one word at a time.
+// Its cost is in docs/performance.md section 1, as that of the other attributes here.
 #[inline(never)]
 pub(crate) fn copy_long(to: &mut [u8], from: &[u8]) {
     let (to_runs, to_rest) = to.as_chunks_mut::<16>();
@@ -60,7 +60,6 @@ fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], by: impl Fn([u8; N]) ->
 
 /// Whether none of the binary32 numbers in `run`, at most [`MAX_RUN`] bytes, is infinite or not a
 /// number.
-#[inline]
 pub(crate) fn all_finite(run: &[u8]) -> bool {
     debug_assert!(run.len() <= MAX_RUN && run.len().is_multiple_of(4));
     match run.len() {
@@ -98,7 +97,6 @@ pub(crate) fn copy_finite(to: &mut [u8], run: &[u8]) -> bool {
     }
 }
 
-#[inline(always)]
 fn one_end<const N: usize>(to: &mut [u8], run: &[u8]) -> bool {
     match (to.first_chunk_mut(), finite_ends::<N>(run)) {
         (Some(target), Some((all, _))) => {
@@ -120,7 +118,6 @@ fn finite_ends<const N: usize>(run: &[u8]) -> Option<(&[u8; N], &[u8; N])> {
 }
 
 /// Whether all bits of the number's exponent are set: adding one to it then carries into the sign.
-#[inline(always)]
 fn is_special(float: [u8; 4]) -> bool {
     ((u32::from_le_bytes(float) & EXPONENT).wrapping_add(EXPONENT_UNIT) as i32) < 0
 }

@@ -12,7 +12,6 @@ use crate::time::Instant;
 
 impl EngineView<'_> {
     /// The connection of a port of Modbus TCP, if the link is one.
-    #[inline]
     pub(crate) fn device_link(&mut self, id: LinkId) -> Option<&mut DeviceLink> {
         self.links.devices.iter_mut().find(|link| link.id() == id)
     }
@@ -22,8 +21,6 @@ impl EngineView<'_> {
         self.links.devices.iter().any(|link| link.port == port)
     }
 
-    #[cold]
-    #[inline(never)]
     pub(crate) fn device_up(&mut self, id: LinkId) {
         let now = self.store.now;
         let Some(link) = self.device_link(id) else { return };
@@ -31,8 +28,6 @@ impl EngineView<'_> {
         self.after_device(id, now);
     }
 
-    #[cold]
-    #[inline(never)]
     pub(crate) fn device_down(&mut self, id: LinkId) {
         let now = self.store.now;
         let Some(link) = self.device_link(id) else { return };
@@ -43,8 +38,6 @@ impl EngineView<'_> {
     }
 
     /// The transport has taken what was handed over.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn device_sent(&mut self, id: LinkId) {
         let Some(link) = self.device_link(id) else { return };
         let (port, is_up) = (link.port, link.supervisor.is_up());
@@ -53,8 +46,6 @@ impl EngineView<'_> {
         }
     }
 
-    #[cold]
-    #[inline(never)]
     pub(crate) fn device_acked(&mut self, id: LinkId, left: u32) {
         let Some(link) = self.device_link(id) else { return };
         if left == 0 {
@@ -63,8 +54,6 @@ impl EngineView<'_> {
     }
 
     /// Bytes of a connection that is up; those of one that was given up are nobody's.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn device_bytes(&mut self, id: LinkId, bytes: &[u8], now: Instant) {
         let Some(link) = self.device_link(id).filter(|link| link.supervisor.is_up()) else { return };
         link.supervisor.heard(now);
@@ -111,15 +100,12 @@ impl EngineView<'_> {
     }
 
     /// Handles the clock.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn advance_connections(&mut self, now: Instant) {
         self.links.devices.iter_mut().for_each(|link| link.advance(now));
         self.carry_connections(now);
     }
 
     /// A port is there while its connection is.
-    #[inline(never)]
     fn carry_connections(&mut self, now: Instant) {
         for nth in 0..self.links.devices.len() {
             let Some(link) = self.links.devices.get(nth) else { break };

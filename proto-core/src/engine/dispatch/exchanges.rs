@@ -16,8 +16,6 @@ use crate::wire::can::CanFrame;
 
 impl EngineView<'_> {
     /// The output of a request, with its record.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn request_output<'b>(
         &mut self,
         (port, request): (PortId, Downward),
@@ -41,8 +39,8 @@ impl EngineView<'_> {
     }
 
     /// Takes bytes; false if the port's recipe has no exchanges.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[cold]
-    #[inline(never)]
     pub(crate) fn exchange_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
         let Some(port) = find_port(self.ports, id) else { return false };
         if port.line().is_none() {
@@ -73,8 +71,6 @@ impl EngineView<'_> {
     }
 
     /// Takes a frame; false if the port's recipe has no exchanges.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn exchange_can(&mut self, id: PortId, frame: &CanFrame, now: Instant) -> bool {
         let (store, command) = (&mut *self.store, self.links.command.first_mut());
         let Some(port) = find_port(self.ports, id) else { return false };
@@ -99,8 +95,6 @@ impl EngineView<'_> {
     }
 
     /// Values in the image have changed: looks at the bits that ask, on all ports.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn check_events(&mut self) {
         let now = self.store.now;
         for nth in 0..self.ports.len() {
@@ -124,8 +118,6 @@ impl EngineView<'_> {
     }
 
     /// Tells the robot what became of events, if that is new or to be repeated.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn tell_outcomes(&mut self, repeats: bool) {
         let mut told = InputSet::EMPTY;
         for item in self.exchanges.items.iter_mut() {
@@ -173,8 +165,6 @@ impl EngineView<'_> {
         }
     }
 
-    #[cold]
-    #[inline(never)]
     pub(crate) fn exchange_sent(&mut self, id: PortId) {
         if let Some(port) = find_port(self.ports, id) {
             port.exchange_sent(self.exchanges.view(), self.clock.now);
@@ -204,8 +194,6 @@ impl EngineView<'_> {
         }
     }
 
-    #[cold]
-    #[inline(never)]
     pub(crate) fn advance_exchange(&mut self, now: Instant) {
         for index in 0..self.ports.len() {
             let Some(port) = self.ports.get_mut(index) else { break };
@@ -232,8 +220,6 @@ impl EngineView<'_> {
     }
 
     /// The next request of a port.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
         if self.clock.has_slept {
             return None;

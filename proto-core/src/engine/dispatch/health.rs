@@ -36,8 +36,6 @@ impl EngineView<'_> {
     }
 
     /// Sets the extra values that output fields show of the ports' health, and of links.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn show_health(&mut self, now: Instant) {
         for nth in 0..self.health.shown.len() {
             let Some(&Shown { of, extra }) = self.health.shown.get(nth) else { break };
@@ -51,8 +49,6 @@ impl EngineView<'_> {
 
     /// Tells the robot what has changed and shows the field the present, just before the cycles of
     /// the ports that show it.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn check_health(&mut self, now: Instant) {
         if self.health.is_reported && now >= self.health.report_at {
             self.tell_changes(now);
@@ -79,8 +75,6 @@ impl EngineView<'_> {
     }
 
     /// Tells the robot at once whether ports work.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn tell_alive(&mut self, now: Instant) {
         self.tell_health(|value| value == PortValue::Alive, false, now);
     }

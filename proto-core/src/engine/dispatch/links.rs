@@ -9,7 +9,6 @@ use crate::engine::io::LinkId;
 use crate::time::Instant;
 
 impl EngineView<'_> {
-    #[cold]
     pub(crate) fn link_up(&mut self, link: LinkId) {
         if self.device_link(link).is_some() {
             return self.device_up(link);
@@ -18,7 +17,6 @@ impl EngineView<'_> {
         self.arm_link(link);
     }
 
-    #[cold]
     pub(crate) fn link_down(&mut self, link: LinkId) {
         if self.device_link(link).is_some() {
             return self.device_down(link);
@@ -28,7 +26,6 @@ impl EngineView<'_> {
         self.arm_link(link);
     }
 
-    #[inline(never)]
     pub(crate) fn link_sent(&mut self, link: LinkId) {
         if self.device_link(link).is_some() {
             return self.device_sent(link);
@@ -38,7 +35,6 @@ impl EngineView<'_> {
         self.arm(deadline);
     }
 
-    #[inline(never)]
     pub(crate) fn link_acked(&mut self, link: LinkId, left: u32) {
         if self.device_link(link).is_some() {
             return self.device_acked(link, left);
@@ -48,7 +44,6 @@ impl EngineView<'_> {
         self.arm(self.links.view().deadline_of(link));
     }
 
-    #[inline(never)]
     pub(crate) fn link_bytes(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
         if self.device_link(link).is_some() {
             return self.device_bytes(link, bytes, now);

@@ -126,6 +126,7 @@ impl EngineView<'_> {
     }
 
     /// The next output, if something may have one.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[inline(never)]
     pub(crate) fn poll_work<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         self.clock.idle_until = Instant::ZERO;
@@ -171,7 +172,6 @@ impl EngineView<'_> {
                     self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
                     return Output::PortSendCan { port, frame };
                 }
-                // On its own, so that nothing else pays for its registers.
                 None if self.exchanges.is_used() => return self.poll_request(now, buf),
                 None => self.clock.dirty.remove(Dirty::PORTS),
             }
@@ -183,15 +183,12 @@ impl EngineView<'_> {
         self.poll_sleep()
     }
 
-    // On its own, so that what is asked is read only once, behind it.
-    #[inline(never)]
     fn ask_all(&mut self) {
         self.clock.dirty.add(Dirty::ALL);
     }
 
     /// The next request to a device, or sleep.
     #[cold]
-    #[inline(never)]
     fn poll_request<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         if let Some(request) = self.next_request(&mut buf[..], now) {
             return self.request_output(request, buf, now);
@@ -240,8 +237,6 @@ impl EngineView<'_> {
     }
 
     /// The line was silent, which ends a device's frame. The timer is not armed.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn port_silent(&mut self, id: PortId, now: Instant) {
         if self.clock.has_slept {
             // Nobody knows how long it has waited.
@@ -286,14 +281,12 @@ impl EngineView<'_> {
         }
     }
 
-    #[cold]
     pub(crate) fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
         self.exchanges_begin(id);
         self.tell_alive(self.clock.now);
     }
 
-    #[cold]
     pub(crate) fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(self.ports, id) else { return };
         self.clock.dirty.add(Dirty::ALL);
@@ -303,7 +296,6 @@ impl EngineView<'_> {
         self.tell_alive(now);
     }
 
-    #[cold]
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
         let Some(port) = find_port(self.ports, id) else { return };
         self.clock.dirty.add(Dirty::ALL);
@@ -358,8 +350,7 @@ impl EngineView<'_> {
         });
     }
 
-    /// [`Self::after_frame`], on its own, where it matters less.
-    #[inline(never)]
+    /// [`Self::after_frame`] in a copy of its own, for callers that can afford a call.
     pub(crate) fn after_field(&mut self, port: PortId, accepted: &Accepted, now: Instant) {
         self.after_frame(port, accepted, now);
     }
@@ -417,8 +408,7 @@ impl EngineView<'_> {
         }
     }
 
-    // On its own, so that engines without triggers do not pay for its registers.
-    #[inline(never)]
+    #[cold]
     fn check_triggers(&mut self) {
         self.show_health(self.store.now);
         if self.exchanges.is_used() {

@@ -23,7 +23,6 @@ impl EngineView<'_> {
     }
 
     /// Whether silence ends a partial frame; when it may, else.
-    #[inline(never)]
     fn ends_partial(&mut self, now: Instant) -> bool {
         self.clock.partial_at = self.partial_deadline();
         now >= self.clock.partial_at
@@ -35,7 +34,6 @@ impl EngineView<'_> {
     }
 
     /// Nothing is to be done until the next deadline or beat.
-    #[inline(always)]
     pub(crate) fn poll_sleep<'b>(&mut self) -> Output<'b> {
         if !self.clock.dirty.has(Dirty::ARMED) {
             self.clock.dirty.add(Dirty::ARMED);
@@ -47,7 +45,6 @@ impl EngineView<'_> {
     }
 
     /// An input has come: the present. An engine that is asleep has nothing late, and no beat to look at.
-    #[inline(always)]
     pub(crate) fn begin(&mut self, was_asleep: bool, now: Instant) -> Instant {
         self.clock.idle_until = Instant::ZERO;
         if was_asleep {
@@ -61,7 +58,6 @@ impl EngineView<'_> {
     }
 
     /// It has been handled: whether the engine was asleep, and has nothing to do before it wakes.
-    #[inline(always)]
     pub(crate) fn end(&mut self, was_asleep: bool) -> Handled {
         if was_asleep
             && self.clock.dirty == Dirty::ARMED
@@ -74,7 +70,6 @@ impl EngineView<'_> {
     }
 
     /// The present, and whether the gateway has slept until now.
-    #[inline(never)]
     fn present(&mut self, now: Instant) -> Instant {
         let now = self.clock.forward(now);
         self.store.now = now;
@@ -92,7 +87,6 @@ impl EngineView<'_> {
 
     /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values
     /// go first, no command is sent, and every connection is opened again.
-    #[cold]
     fn wake(&mut self, now: Instant) {
         self.clock.sleeps = self.clock.sleeps.wrapping_add(1);
         // Before deadlines pass: one of them may be to open a link that has been down.
@@ -140,8 +134,6 @@ impl EngineView<'_> {
     }
 
     /// Reads the frames that silence has ended, of all ports that have one.
-    #[cold]
-    #[inline(never)]
     fn read_ended(&mut self, now: Instant) {
         for index in 0..self.ports.len() {
             if let Some(port) = self.ports.get(index)
@@ -193,14 +185,12 @@ impl EngineView<'_> {
     }
 
     /// Drops values that have waited too long.
-    #[inline(always)]
     pub(crate) fn expire_waiting(&mut self) {
         if self.store.may_expire() {
             self.drop_expired();
         }
     }
 
-    #[inline(never)]
     fn drop_expired(&mut self) {
         let ports = &mut *self.ports;
         self.store.expire_waiting(|port, dropped| {

@@ -206,8 +206,6 @@ impl<'a> Outputs<'a> {
     }
 
     /// The number that is sent for `number`; not a number if none is.
-    #[cold]
-    #[inline(never)]
     fn sent(self, binding: &OutputBind, number: f64) -> f64 {
         let allowed = self.sendable.iter().skip(usize::from(binding.first_sendable));
         let mut sent = f64::NAN;

@@ -130,7 +130,6 @@ pub(crate) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> 
 
 impl DeviceCodec {
     /// The frames of a recipe, whose bindings will begin at these places.
-    #[inline(never)]
     pub(crate) fn new(
         config: ConfigView<'_>,
         index: u8,
@@ -190,7 +189,6 @@ impl DeviceCodec {
 
 impl FieldPort {
     /// Reads the frames in `rest`; see [`FieldPort::frames`].
-    #[inline(never)]
     pub(crate) fn device_frames(
         &mut self,
         rest: &mut &[u8],
@@ -274,7 +272,6 @@ impl FieldPort {
     }
 
     /// A frame from the bus; see [`FieldPort::can`].
-    #[inline(never)]
     pub(crate) fn device_can(
         &mut self,
         frame: &CanFrame,
@@ -304,7 +301,6 @@ impl FieldPort {
     }
 
     /// The frame of the device that is due.
-    #[inline(never)]
     pub(crate) fn next_device(
         &mut self,
         image: &Image,

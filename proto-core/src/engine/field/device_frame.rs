@@ -147,8 +147,6 @@ impl FrameContext<'_> {
     }
 
     /// What becomes of each field of a frame.
-    #[cold]
-    #[inline(never)]
     fn sort(&self, format: &DeviceFormat, texts: &[TextBind], frame: &[u8]) -> Sorted {
         let mut sorted = Sorted::default();
         let bindings = format.bindings.of(self.bindings);
@@ -200,8 +198,6 @@ impl FrameContext<'_> {
     }
 
     /// Applies a frame with fields that are not taken. `is_block` says that then nothing of it is.
-    #[cold]
-    #[inline(never)]
     fn take_in_part(
         &mut self,
         format: &DeviceFormat,
@@ -240,7 +236,6 @@ impl FrameContext<'_> {
 
     /// Puts the values of a frame into their variables, and counts the frame; `sorted` says which are not taken, if not all
     /// are.
-    #[inline(always)]
     fn apply(&mut self, format: &DeviceFormat, texts: &[TextBind], frame: &[u8], sorted: Option<&Sorted>) {
         let all = self.bindings;
         let bindings = format.bindings.of(all);
@@ -280,8 +275,6 @@ impl FrameContext<'_> {
         bump(&mut self.counters.frames_in);
     }
 
-    #[cold]
-    #[inline(never)]
     fn apply_ruled<'f>(
         &mut self,
         (binding, rules): (&InputBind, Rules<'f>),

@@ -634,8 +634,6 @@ fn answered(
 }
 
 /// The peer is at it, and there.
-#[cold]
-#[inline(never)]
 fn goes_on(
     line: &mut Line,
     items: &mut [ExchangeItem],
@@ -651,8 +649,6 @@ fn goes_on(
 }
 
 /// Takes the values of a pending answer or a refusal, if it has any.
-#[cold]
-#[inline(never)]
 fn take_other(
     frames: &mut FrameContext<'_>,
     other: Option<&OtherFormat>,
@@ -668,8 +664,6 @@ fn take_other(
 
 /// Looks in a reply that was taken for the number that tells that its peer has restarted: it has, if the reply before had
 /// another one there. What is asked at its start is asked again.
-#[cold]
-#[inline(never)]
 fn look_for_restart(
     line: &mut Line,
     items: &mut [ExchangeItem],

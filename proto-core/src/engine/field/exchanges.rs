@@ -117,7 +117,6 @@ impl RestartSign {
 }
 
 impl Exchanges<'_> {
-    #[inline(always)]
     pub(crate) fn is_used(&self) -> bool {
         !self.items.is_empty()
     }

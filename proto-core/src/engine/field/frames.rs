@@ -37,7 +37,6 @@ pub(crate) struct FrameContext<'a> {
 
 impl<'a> FrameContext<'a> {
     // The parts of a port one by one: its codec is in use meanwhile.
-    #[inline(always)]
     pub(crate) fn new(
         (port, mode): (PortId, Mode),
         reply: &'a mut ReplyCode,
@@ -96,7 +95,6 @@ impl FrameContext<'_> {
         Ok(())
     }
 
-    #[inline(always)]
     fn again(&mut self) -> FrameContext<'_> {
         let commands = self.commands.as_deref_mut();
         FrameContext::new(
@@ -110,6 +108,7 @@ impl FrameContext<'_> {
     }
 
     /// Applies the values of a user-defined frame, all or none.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[inline(never)]
     fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
         if layout.check(payload).is_err() {

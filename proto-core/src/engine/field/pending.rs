@@ -192,7 +192,6 @@ pub(crate) fn answers_of(item: &ExchangeItem) -> impl Iterator<Item = &DeviceFor
     (0..3_u8).filter_map(|nth| answer_of(item, nth))
 }
 
-#[inline(never)]
 fn answer_of(item: &ExchangeItem, nth: u8) -> Option<&DeviceFormat> {
     if !matches!(item.asks, Asks::Frame | Asks::Remote { .. }) {
         return None;

@@ -133,6 +133,7 @@ impl FieldPort {
     /// Takes bytes from the line that only continue or begin a frame: nothing but a deadline comes of them. The
     /// deadline, if it may be earlier than before; [`Instant::NEVER`] if not. `None` if [`Self::frames`] has to read
     /// them; then nothing was taken.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[inline]
     pub(crate) fn hold(&mut self, bytes: &[u8], now: Instant) -> Option<Instant> {
         let Codec::Stream { input: Some(layout), deframer, .. } = &mut self.codec else { return None };
@@ -198,7 +199,6 @@ impl FieldPort {
     }
 
     /// Bytes for a port whose recipe has no input part.
-    #[cold]
     pub(crate) fn not_asked_for(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
         bump(&mut self.counters.rejected_no_input);
         tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
@@ -227,7 +227,6 @@ impl FieldPort {
     /// Whether a rejected CAN frame is worth keeping. On a shared bus, frames for others are not, unless
     /// none of the recipe's ids has ever come: then the id may be the one that was meant. A busy bus shows one
     /// each 100 ms, because keeping a frame takes longer than rejecting it.
-    #[inline]
     pub(crate) fn is_news(&self, why: Rejection, now: Instant) -> bool {
         let may_be_meant = |last: &LastRejection| {
             self.counters.frames_in == 0
@@ -250,7 +249,6 @@ impl FieldPort {
         true
     }
 
-    #[inline(always)]
     fn take_can(
         &mut self,
         frame: &CanFrame,
@@ -314,14 +312,12 @@ impl FieldPort {
     }
 
     /// When something happens on the port without an input.
-    #[inline]
     pub(crate) fn deadline(&self) -> Instant {
         self.partial_until().min(self.send_deadline())
     }
 
     /// The same after something was heard, if that has begun a frame or made one due; other deadlines stay as they
     /// were. A port that may have an output is to be asked.
-    #[inline(always)]
     pub(crate) fn deadline_of_heard(&self, ask: &mut Dirty) -> Option<Instant> {
         let is_due = self.sender.is_due();
         ask.add(Dirty::PORTS.when(is_due));
@@ -329,13 +325,11 @@ impl FieldPort {
     }
 
     /// When something may be sent without an input.
-    #[inline]
     pub(crate) fn send_deadline(&self) -> Instant {
         self.sender.deadline(self.line.quiet_at())
     }
 
     /// When the frame that has begun is given up; [`Instant::NEVER`] if none has.
-    #[inline]
     pub(crate) fn partial_until(&self) -> Instant {
         debug_assert_eq!(self.is_partial, self.has_begun(), "not noted");
         self.line.partial_until(self.is_partial)
@@ -361,13 +355,10 @@ impl FieldPort {
     }
 
     /// Bytes came, or were dropped.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn note_partial(&mut self) {
         self.is_partial = self.has_begun();
     }
 
-    #[cold]
     pub(crate) fn discard_partial(&mut self, tap: &mut Tap, now: Instant) {
         let deframer = match &mut self.codec {
             Codec::Stream { deframer, .. } => deframer,
@@ -418,8 +409,6 @@ impl FieldPort {
     }
 }
 
-#[cold]
-#[inline(never)]
 pub(crate) fn keep(
     last: &mut Option<LastRejection>,
     why: Rejection,
@@ -431,7 +420,6 @@ pub(crate) fn keep(
 }
 
 /// Keeps why a device's frame was rejected, or a field of it.
-#[inline]
 pub(crate) fn keep_why(
     last: &mut Option<LastRejection>,
     verdict: Result<(), Rejection>,
@@ -473,7 +461,6 @@ pub(crate) fn fields_before(layout: &CanLayout, index: usize) -> usize {
 const FOREIGN_PAUSE: Duration = Duration::from_millis(100);
 
 /// The port with this number: its place, if no listening port comes before it.
-#[inline]
 pub(crate) fn find_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
     let nth = usize::from(id.0);
     match ports.get(nth) {
@@ -482,8 +469,6 @@ pub(crate) fn find_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut Fiel
     }
 }
 
-#[cold]
-#[inline(never)]
 fn search_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
     ports.iter_mut().find(|port| port.id == id)
 }

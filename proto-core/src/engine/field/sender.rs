@@ -22,7 +22,6 @@ impl GroupSet {
     }
 
     /// Whether something is true of all its groups.
-    #[inline(always)]
     fn all(self, is_true: impl Fn(GroupId) -> bool) -> bool {
         for (nth, word) in self.0.into_iter().enumerate() {
             let mut left = word;
@@ -155,7 +154,6 @@ impl Sender {
     }
 
     /// The same, if nothing else is due; else it is not noted, and the answer is `false`.
-    #[inline(always)]
     pub(crate) fn sent_before_next(&mut self) -> bool {
         self.in_flight &= self.due;
         !self.due
@@ -200,7 +198,6 @@ impl Sender {
     }
 
     /// This many input frames were accepted at once: the newest is answered.
-    #[inline(always)]
     pub(crate) fn frames_accepted(
         &mut self,
         count: u32,
@@ -213,7 +210,6 @@ impl Sender {
         }
     }
 
-    #[inline(never)]
     fn answer_newest(&mut self, count: u32, counters: &mut PortCounters, now: Instant) {
         counters.skipped_cycles = counters.skipped_cycles.wrapping_add(count.wrapping_sub(1));
         self.raise(counters, Since::at(now));
@@ -239,7 +235,6 @@ impl Sender {
     }
 
     /// Whether the values may be sent at `now`: all known, and fresh unless the recipe holds.
-    #[inline(always)]
     pub(crate) fn may_show(&self, image: &Image, now: Instant) -> bool {
         (!image.has_unreadable() || self.can_show(image, now))
             && self.sources.all(|group| match image.stamp_of(group) {
@@ -249,8 +244,6 @@ impl Sender {
     }
 
     /// Whether all values are readable, and those whose fields are rejected are fresh: their frames' age is not theirs.
-    #[cold]
-    #[inline(never)]
     fn can_show(&self, image: &Image, now: Instant) -> bool {
         image.can_read(&self.shown, self.shown_extra)
             && self
@@ -261,12 +254,10 @@ impl Sender {
 
     /// Whether a frame with this digest is new, on a port that sends only changes, or is to be sent
     /// again. Other ports pay for no digest.
-    #[inline(always)]
     pub(crate) fn is_news(&mut self, digest: impl FnOnce() -> u64, now: Instant) -> bool {
         self.on != SendOn::Change || self.is_change(digest(), now)
     }
 
-    #[inline(never)]
     fn is_change(&mut self, digest: u64, now: Instant) -> bool {
         let news = self.digest != Some(digest) || now >= self.refresh_at;
         self.digest = Some(digest);

@@ -183,7 +183,6 @@ impl FieldPort {
     }
 
     /// Carries out what a master asks; its reply is kept until the line is free.
-    #[inline(never)]
     pub(crate) fn serve(
         &mut self,
         (inputs, outputs): (&[InputBind], Outputs<'_>),

@@ -262,7 +262,6 @@ fn judge<'f>(
 
 impl FieldPort {
     /// Whether silence ends frames on this port, and one has begun.
-    #[cold]
     pub(crate) fn ends_by_silence(&self) -> bool {
         let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, .. }), .. }) = &self.codec
         else {
@@ -272,7 +271,6 @@ impl FieldPort {
     }
 
     /// These bytes are lost; what they began cannot be trusted.
-    #[cold]
     pub(crate) fn lose(&mut self, bytes: &[u8]) {
         let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, .. }), formats, .. }) =
             &mut self.codec
@@ -286,7 +284,6 @@ impl FieldPort {
     }
 
     /// Reads the frames in `rest`, or the one that silence has ended if it is empty.
-    #[inline(never)]
     pub(crate) fn whole_frames(
         &mut self,
         rest: &mut &[u8],

@@ -566,7 +566,6 @@ impl CommandLink {
         own.min().unwrap_or(Instant::NEVER).min(waiting).min(stops)
     }
 
-    #[inline(never)]
     fn stops_deadline(&self) -> Instant {
         let goes_at = match self.way_of_stops() {
             Some(_) => self.stop_may_go_at(),

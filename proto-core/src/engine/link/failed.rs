@@ -24,7 +24,6 @@ impl FailedCommands {
     }
 
     /// The controller replied to a command.
-    #[inline]
     pub(crate) fn note(&mut self, command: Waiting, code: ReplyCode, now: Instant) {
         if code == ReplyCode::Fail
             && let Some(failed) = self.newest.get_mut(usize::from(command.port.0))
@@ -35,8 +34,6 @@ impl FailedCommands {
     }
 
     /// What the newest state packet says, and when it came.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn note_states(&mut self, newest: Option<([u8; 4], Instant)>) {
         self.is_open = false;
         self.newest.iter_mut().flatten().for_each(|failed| failed.note_states(newest));

@@ -147,12 +147,10 @@ impl<'a> LinksView<'a> {
     }
 
     /// When something happens on one link without an input.
-    #[inline(never)]
     pub(crate) fn deadline_of(self, id: LinkId) -> Instant {
         self.find_deadline(id)
     }
 
-    #[inline(always)]
     fn find_deadline(self, id: LinkId) -> Instant {
         let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
         let deadline = match id {
@@ -168,7 +166,6 @@ impl<'a> LinksView<'a> {
     }
 
     // Not a chain of iterators, which each use of it would have code of its own for.
-    #[inline(never)]
     fn nth(self, mut nth: usize) -> Option<LinkInfo<'a>> {
         if let Some(link) = self.command {
             let session = match (nth, &link.urgent) {
@@ -242,8 +239,6 @@ impl Links<'_> {
     }
 
     /// Where a link of [`Self::infos`] goes; the host's name is written into `buf`.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn endpoint<'b>(&self, id: LinkId, buf: &'b mut [u8]) -> Endpoint<'b> {
         let to = self.view().infos().find(|info| info.id == id).map(|info| info.endpoint);
         let to = to.unwrap_or(Endpoint::new(Transport::Tcp { port: 0 }, ""));
@@ -378,7 +373,6 @@ impl Links<'_> {
     /// The next output to the controller: commands that stop the robot, then field values, then
     /// other commands. With it, the earliest of the link's deadlines that may have come earlier. Links that have nothing
     /// to send until something else happens are no longer in `ask`.
-    #[inline(always)]
     pub(crate) fn next_upward(
         &mut self,
         ask: &mut Dirty,
@@ -420,7 +414,6 @@ impl Links<'_> {
 
     /// What may have an output when something has happened to this link. Beside a command link, which looks at what the
     /// others do, all.
-    #[inline(always)]
     pub(crate) fn ask_of(&self, link: LinkId) -> Dirty {
         if !self.command.is_empty() {
             return Dirty::LINKS;
@@ -434,7 +427,6 @@ impl Links<'_> {
 
     /// What may have an output after bytes came on this link, and the earliest of its deadlines that may have come
     /// earlier.
-    #[inline(always)]
     pub(crate) fn asked_by_bytes(
         &mut self,
         id: LinkId,
@@ -463,12 +455,10 @@ impl Links<'_> {
     }
 
     /// The same, and the links that write one of these variables, which wait.
-    #[inline(always)]
     pub(crate) fn ask_for(&self, waiting: &InputSet, asked: Dirty) -> Dirty {
         if waiting.is_empty() { asked } else { self.ask_writers(waiting, asked) }
     }
 
-    #[inline(never)]
     fn ask_writers(&self, waiting: &InputSet, mut asked: Dirty) -> Dirty {
         let is_wanted = |writes: &InputSet| !waiting.and(writes).is_empty();
         asked.add(Dirty::RECIPES.when(self.recipes.iter().any(|link| is_wanted(&link.writes))));

@@ -204,8 +204,6 @@ impl ModbusLink {
     }
 
     /// A request of so many bytes is handed over. Returns their number.
-    // By whoever writes it: a result with the sets in it would be copied from place to place.
-    #[inline]
     fn asked(&mut self, len: usize, asked: Asked, next: First, now: Instant) -> Option<usize> {
         self.first = next;
         bump(&mut self.counters.sent);
@@ -218,7 +216,6 @@ impl ModbusLink {
 
     /// The transport took a request that is still to be answered: nothing else can be asked before. `None` if something
     /// can be; then it was not noted. Otherwise [`Instant::NEVER`], as no deadline has changed.
-    #[inline(always)]
     pub(crate) fn sent_before_answer(&mut self) -> Option<Instant> {
         self.in_flight.as_ref()?;
         self.unsent = false;
@@ -226,7 +223,6 @@ impl ModbusLink {
     }
 
     /// Whether [`Self::next_request`] may have one, on a link that is up.
-    #[inline(always)]
     pub(crate) fn may_ask(&mut self, waiting: &InputSet, now: Instant) -> bool {
         if self.in_flight.is_some() || self.unsent {
             return false;
@@ -239,7 +235,6 @@ impl ModbusLink {
     }
 
     /// When the transaction in flight is given up; [`Instant::NEVER`] if none is.
-    #[inline(always)]
     pub(crate) fn answer_deadline(&self) -> Instant {
         self.in_flight.map_or(Instant::NEVER, |asked| asked.until)
     }
@@ -257,8 +252,6 @@ impl ModbusLink {
     }
 
     /// The controller has the safe bits of the write that it has answered.
-    #[cold]
-    #[inline(never)]
     fn confirm_bits(&mut self, store: &mut Store) {
         if let Some((var, bits)) = self.safe_bits.take() {
             store.confirm_bits(var, bits & store.bits.safe.byte(var));
@@ -266,8 +259,6 @@ impl ModbusLink {
     }
 
     /// What came is no Modbus: the connection is closed.
-    #[cold]
-    #[inline(never)]
     fn violated(&mut self, store: &mut Store) {
         bump(&mut self.counters.malformed);
         self.supervisor.give_up(store.now);
@@ -275,8 +266,6 @@ impl ModbusLink {
     }
 
     /// The controller has refused a request.
-    #[cold]
-    #[inline(never)]
     fn refused(&mut self, asked: &Asked, now: Instant) {
         bump(&mut self.counters.refused);
         if let Asked::Write { safe, .. } = asked
@@ -319,7 +308,6 @@ impl ModbusLink {
     }
 
     /// One request for the first pending variable and those that follow it without a gap.
-    #[inline(never)]
     fn write(&mut self, store: &mut Store, out: &mut [u8]) -> Option<usize> {
         // Once more: a set that is handed over does not stay in registers.
         let mut pending = store.outbox.dirty().and(&self.writes);
@@ -338,8 +326,6 @@ impl ModbusLink {
     }
 
     /// Where bits have owners: a request for some of them, or the whole variables whose turn it is.
-    #[cold]
-    #[inline(never)]
     fn beside_bits(&mut self, store: &mut Store, out: &mut [u8]) -> Beside {
         let pending = store.outbox.dirty().and(&self.writes);
         match self.bits_turn(&pending, store) {
@@ -354,8 +340,6 @@ impl ModbusLink {
     }
 
     /// What waits beside a request counts as offered with it.
-    #[cold]
-    #[inline(never)]
     fn offer_the_rest(&mut self, store: &Store) {
         if !store.outbox.dirty().and(&self.writes).is_empty()
             && let Some(InFlight { asked: Asked::Write { born, .. }, .. }) = self.in_flight
@@ -365,7 +349,6 @@ impl ModbusLink {
     }
 
     /// One request for a variable and those that follow it without a gap.
-    #[inline(always)]
     fn write_whole(
         &mut self,
         first: SysVar,
@@ -425,8 +408,6 @@ impl ModbusLink {
 
     /// Whose turn it is where bits have owners: the first variable at or behind the cursor, or the
     /// first run of waiting bits there.
-    #[cold]
-    #[inline(never)]
     fn bits_turn(&self, pending: &InputSet, store: &Store) -> Option<Turn> {
         let turn = |var: SysVar, from: u8| {
             if !store.bits.bytes.contains(var) {
@@ -446,8 +427,6 @@ impl ModbusLink {
     }
 
     /// One request for a run of bits that have owners.
-    #[cold]
-    #[inline(never)]
     fn write_bits(&mut self, var: SysVar, mask: u8, store: &mut Store, out: &mut [u8]) -> Option<usize> {
         let (first, _) = place_of(var)?;
         let (from, count) = (mask.trailing_zeros(), mask.count_ones());
@@ -486,7 +465,6 @@ impl Connection for ModbusLink {
         store.link_lost(&self.writes);
     }
 
-    #[inline(never)]
     fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         let now = store.now;
         let mut rest = bytes;

@@ -25,8 +25,6 @@ pub(crate) fn take_poll(block: &Block, polled: &[SysVar], response: Response<'_>
 }
 
 /// The same where bits have owners.
-#[cold]
-#[inline(never)]
 fn take_values_beside_bits(block: &Block, polled: &[SysVar], response: Response<'_>, store: &mut Store) {
     take_values(block, polled, response, |var, value| match value {
         Scalar::Byte(shown) if store.bits.bytes.contains(var) => store.show_bits(var, shown),
@@ -34,7 +32,6 @@ fn take_values_beside_bits(block: &Block, polled: &[SysVar], response: Response<
     });
 }
 
-#[inline(always)]
 fn take_values(
     block: &Block,
     polled: &[SysVar],

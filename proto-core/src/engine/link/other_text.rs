@@ -35,8 +35,6 @@ pub(crate) struct LastText {
 }
 
 impl LastText {
-    #[cold]
-    #[inline(never)]
     pub(crate) fn new(at: Instant, bytes: &[u8], command: Option<Waiting>) -> Self {
         let mut text = String::new();
         let letters = bytes.utf8_chunks().flat_map(|chunk| {

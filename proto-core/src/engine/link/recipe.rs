@@ -144,7 +144,6 @@ impl Uplink {
     }
 
     /// The same, if there is something to send. Mostly there is not: so the check stays short.
-    #[inline(never)]
     fn send(
         &mut self,
         wanted: bool,
@@ -188,7 +187,6 @@ impl Uplink {
 
     /// The transport took what was sent, and nothing else is to be sent before `until`. Returns when that is; `None` if
     /// there may be something, and then it was not noted.
-    #[inline(always)]
     pub(crate) fn sent_before_next(&mut self, outbox: &Outbox, until: Instant) -> Option<Instant> {
         let speaks_at = self.speaks_at();
         if !self.supervisor.is_up()
@@ -215,14 +213,12 @@ impl Uplink {
 
     /// Whether every variable of the frame has a value that its owner sent or that was just read
     /// back.
-    #[inline(always)]
     pub(crate) fn is_ready(&self, store: &Store, state: impl FnOnce() -> Option<GroupId>) -> bool {
         let others = self.set.minus(&store.live);
         others.is_empty() || self.are_known(&others, store, state())
     }
 
     /// The same of those that have no value of their owner.
-    #[inline(never)]
     fn are_known(&self, others: &InputSet, store: &Store, state: Option<GroupId>) -> bool {
         let read_back = state
             .and_then(|group| store.image.stamp_of(group))
@@ -276,7 +272,6 @@ impl Connection for Uplink {
         store.link_lost(&self.writes);
     }
 
-    #[inline(never)]
     fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         let now = store.now;
         let (Some(layout), Some(group)) = (&self.output, self.group) else {
@@ -355,7 +350,6 @@ impl Connection for Uplink {
         self.repeat_at = now + if fast { REPEAT_EVERY } else { REPEAT_SLOWLY };
     }
 
-    #[inline]
     fn deadline(&self) -> Instant {
         let speaks_at = if self.busy { Instant::NEVER } else { self.speaks_at() };
         speaks_at.min(self.flight.deadline()).min(self.repeat_at)
@@ -369,7 +363,6 @@ fn is_new(store: &Store) -> bool {
 
 /// Writes a frame into the image. A value that is not finite makes its variable unknown; the others
 /// are used. Returns the number of such values.
-#[inline(never)]
 fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize {
     let system = |field: PlacedField| match field.field {
         Field::System(var) => Some(var),

@@ -90,7 +90,6 @@ impl StateLink {
 
     /// Takes bytes that do not complete a packet: what is heard only makes deadlines later. `false` if
     /// [`Connection::received`] has to read them, or nothing of this connection counts; then nothing was taken.
-    #[inline]
     pub(crate) fn hold(&mut self, bytes: &[u8], now: Instant) -> bool {
         if !self.supervisor.is_up() || !self.stream.hold(bytes) {
             return false;
@@ -109,7 +108,6 @@ impl Connection for StateLink {
         self.stream.reset();
     }
 
-    #[inline(never)]
     fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         let mut rest = bytes;
         while let Some(packet) = self.stream.next_packet(&mut rest) {
@@ -165,7 +163,6 @@ impl Connection for StateLink {
 
 /// The first variables that follow each other in the table, and so in the packet and in the image; at most what is
 /// copied at once.
-#[inline]
 fn next_run(shown: &[SysVar]) -> Option<(&[SysVar], &[SysVar])> {
     let first = shown.first()?;
     let most = first.left_in_row().min(MAX_RUN.checked_div(first.size()).unwrap_or(1));
@@ -176,7 +173,6 @@ fn next_run(shown: &[SysVar]) -> Option<(&[SysVar], &[SysVar])> {
 
 /// Copies a run of words or floats. `None`, with nothing changed, if its variables have to be looked at one by one:
 /// bits, a value that is not finite, or one before it that was not.
-#[inline]
 fn take_run(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> Option<()> {
     let first = run.first()?;
     if first.is_bits() || image.has_unreadable() {
@@ -192,7 +188,6 @@ fn take_run(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> Option<(
 }
 
 /// Takes a run's variables one by one; returns how many cannot be read.
-#[inline(never)]
 fn take_each(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> usize {
     let is_unreadable =
         |var: &&SysVar| !view.read_var(**var).is_some_and(|value| image.receive(**var, value));
@@ -200,8 +195,6 @@ fn take_each(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> usize {
 }
 
 /// Reads back the bits that none of our ports has sent.
-#[cold]
-#[inline(never)]
 fn read_bits(view: &StateView<'_>, bytes: &InputSet, store: &mut Store) {
     for var in bytes.iter() {
         if let Some(Scalar::Byte(shown)) = view.read_var(var) {
@@ -211,9 +204,7 @@ fn read_bits(view: &StateView<'_>, bytes: &InputSet, store: &mut Store) {
     }
 }
 
-/// Keeps the packet's other values that ports show; returns how many are unreadable. On its own, so
-/// that a gateway without them does not pay for its registers.
-#[inline(never)]
+/// Keeps the packet's other values that ports show; returns how many are unreadable.
 fn keep(kept: &[Kept], view: &StateView<'_>, image: &mut Image) -> usize {
     let unreadable = kept.iter().filter(|kept| !image.receive_extra(kept.extra, kept.read(view)));
     unreadable.count()

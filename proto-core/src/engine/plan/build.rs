@@ -141,8 +141,6 @@ impl EngineView<'_> {
         Ok(())
     }
 
-    /// Not inlined, nor are the other parts that make large values: their stacks would add up.
-    #[inline(never)]
     fn add_port(
         &mut self,
         config: ConfigView<'_>,
@@ -304,7 +302,6 @@ impl EngineView<'_> {
     }
 
     /// What stands behind the input fields of a port follows its bindings, in the order of the fields.
-    #[inline(never)]
     fn add_rules(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
         let fields = self.bindings.inputs.capacity();
         let mut scale = None;
@@ -339,7 +336,6 @@ impl EngineView<'_> {
 
     /// Lays out the frames of the port that was added last. In its place: a codec is large, and each
     /// time that it is passed on it is copied.
-    #[inline(never)]
     fn add_codec(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
         let Some(own) = self.ports.last_mut() else { return Ok(()) };
         // Validation has refused recipes that the bus cannot carry.
@@ -376,7 +372,6 @@ impl EngineView<'_> {
         Ok(())
     }
 
-    #[inline(never)]
     fn add_command_link(&mut self, config: ConfigView<'_>, dialect: Dialect) -> Result<(), BuildError> {
         let link = CommandLink::new(config.controller.command_port, dialect, config.commands);
         let link = link.ok_or(one_too_many(Counted::CommandBytes, MAX_COMMAND_BYTES))?;
@@ -384,7 +379,6 @@ impl EngineView<'_> {
         Ok(())
     }
 
-    #[inline(never)]
     fn add_uplink(
         &mut self,
         config: ConfigView<'_>,
@@ -474,7 +468,6 @@ impl EngineView<'_> {
         }
     }
 
-    #[inline(never)]
     fn assign_sources(
         &mut self,
         config: ConfigView<'_>,

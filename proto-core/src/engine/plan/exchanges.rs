@@ -97,7 +97,6 @@ impl Formats<'_> {
     }
 
     /// The data of Modbus registers or coils that are sent.
-    #[inline(never)]
     fn data_out(&mut self, span: Span) -> Result<Option<DeviceFormat>, BuildError> {
         let fields: &[FieldSpec] = span.of(self.config.fields);
         if fields.is_empty() {
@@ -108,7 +107,6 @@ impl Formats<'_> {
     }
 
     /// The same for those that are received.
-    #[inline(never)]
     fn data_in(&mut self, span: Span) -> Result<Option<InputFormat>, BuildError> {
         let fields: &[FieldSpec] = span.of(self.config.fields);
         if fields.is_empty() {
@@ -118,29 +116,24 @@ impl Formats<'_> {
         self.input(frame, None).map(Some)
     }
 
-    #[inline(never)]
     fn request_of(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
         self.format(Direction::Output, spec.layout(self.config, Direction::Output), spec.id)
     }
 
-    #[inline(never)]
     fn reply_of(&mut self, spec: &FrameSpec) -> Result<InputFormat, BuildError> {
         self.input(spec.layout(self.config, Direction::Input), spec.id)
     }
 
-    #[inline(never)]
     fn other_of(&mut self, spec: &FrameSpec) -> Result<OtherFormat, BuildError> {
         let has_values = has_values(spec.fields.of(self.config.fields));
         self.other(spec.layout(self.config, Direction::Input), spec.id, has_values)
     }
 
     /// Bytes of a reply to a remote request.
-    #[inline(never)]
     fn longest_of(&self, spec: &FrameSpec) -> usize {
         spec.layout(self.config, Direction::Input).map_or(0, |frame| frame.layout.lengths().1)
     }
 
-    #[inline(never)]
     fn item(&mut self, exchange: &Exchange) -> Result<ExchangeItem, BuildError> {
         let mut item = ExchangeItem {
             asks: Asks::Nothing,
@@ -221,7 +214,6 @@ impl Formats<'_> {
 impl EngineView<'_> {
     /// Adds the exchanges of a port, whose fields and input frames behind those of its parts are at
     /// these places.
-    #[inline(never)]
     pub(crate) fn add_exchanges(
         &mut self,
         config: ConfigView<'_>,

@@ -14,7 +14,6 @@ use crate::wire::dialect::Dialect;
 impl EngineView<'_> {
     /// Gives values of the state packet and of the health of ports their places among the image's
     /// extra values.
-    #[inline(never)]
     pub(crate) fn assign_extra(&mut self, dialect: &Dialect) -> Result<(), BuildError> {
         let mut used = 0_u8;
         let mut next = || {

@@ -116,8 +116,6 @@ impl Bits {
     }
 
     /// An input frame writes this bit; `None` if there are too many shares.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn add(&mut self, bit: VarBit, frame: u8, port: u8) -> Option<()> {
         let mask = bit.mask().unwrap_or(0);
         let same = |share: &&mut Share| share.frame == frame && share.var == bit.var;
@@ -216,7 +214,6 @@ impl Bits {
 
     /// A group is overdue, that of a frame or of rejected fields: its bits take their safe values in place of everything
     /// that waits. Bits without one hold.
-    #[inline(never)]
     pub(crate) fn time_out(
         &mut self,
         group: GroupId,

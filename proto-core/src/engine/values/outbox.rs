@@ -113,7 +113,6 @@ impl Outbox {
     }
 
     /// Variables with a value to write.
-    #[inline]
     pub(crate) fn dirty(&self) -> InputSet {
         self.dirty
     }
@@ -173,7 +172,6 @@ impl Outbox {
     }
 
     /// An accepted frame set variables that are not bits.
-    #[inline]
     pub(crate) fn offer_analog(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.or(vars);
     }
@@ -234,7 +232,6 @@ impl Outbox {
     }
 
     /// The variables' values have been handed over to their link.
-    #[inline]
     pub(crate) fn taken(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.minus(vars);
     }

@@ -169,6 +169,7 @@ impl<Q> Store<Q> {
 impl Store {
     /// The values of an accepted frame are in the image: they are to be written. Returns those
     /// whose link is up.
+    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
     #[inline(always)]
     pub(crate) fn accepted(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         let now = self.now;
@@ -187,7 +188,6 @@ impl Store {
     }
 
     /// These variables have a value of their owner again. Whether the links of all are up.
-    #[inline(always)]
     fn settle(&mut self, set: &InputSet) -> bool {
         self.live = self.live.or(set);
         if !self.safe.and(set).is_empty() {
@@ -204,7 +204,6 @@ impl Store {
     }
 
     /// A frame came and says nothing: its values stay as they are, and it is not overdue.
-    #[cold]
     pub(crate) fn not_overdue(&mut self, nth: usize) {
         let Some(frame) = self.frames.get_mut(nth) else { return };
         frame.overdue_at = self.now + frame.timeout;
@@ -212,7 +211,6 @@ impl Store {
     }
 
     /// The values of the newest frame may be as old as this: their age runs from the request that they could belong to.
-    #[cold]
     pub(crate) fn was_asked(&mut self, nth: usize, since: Instant) {
         let group = GroupId(nth as u8);
         let Some(frame) = self.frames.get_mut(nth) else { return };
@@ -224,13 +222,11 @@ impl Store {
         self.next_overdue.or_earlier(frame.overdue_at);
     }
 
-    /// [`Self::accepted`], on its own, where it matters less.
-    #[inline(never)]
+    /// [`Self::accepted`] in a copy of its own, for callers that can afford a call.
     pub(crate) fn accepted_apart(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         self.accepted(nth, counters)
     }
 
-    #[inline(always)]
     fn offer(&mut self, port: usize, vars: &InputSet, counters: &mut PortCounters) {
         self.outbox.offer_analog(&vars.minus(&InputSet::BYTES));
         if !vars.and(&InputSet::BYTES).is_empty() {
@@ -249,7 +245,6 @@ impl Store {
 
     /// The same for a frame with variables whose link is down, or with bits that have owners.
     #[cold]
-    #[inline(never)]
     fn accepted_in_part(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         let Some(frame) = self.frames.get(nth) else { return InputSet::EMPTY };
         let (set, port) = (frame.set, usize::from(frame.port));
@@ -336,8 +331,6 @@ impl Store {
     }
 
     /// Handles the first rejected field that is overdue.
-    #[cold]
-    #[inline(never)]
     fn next_field_timeout(&mut self, safe: &[SafeBytes]) -> Option<Overdue> {
         if let Some(field) = self.withheld.next_command(self.now) {
             return Some(Overdue::Command(field));
@@ -422,7 +415,6 @@ impl Store {
     }
 
     /// Whether a value may have waited for longer than its port's timeout.
-    #[inline(always)]
     pub(crate) fn may_expire(&self) -> bool {
         self.now >= self.next_expiry.get()
     }
@@ -516,8 +508,6 @@ impl Store {
     }
 
     /// These bits have been handed over to their link.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn bits_taken(&mut self, bits: BitSet) {
         self.bits.taken(bits, &mut self.edges);
         self.bits_changed();
@@ -555,8 +545,6 @@ impl Store {
     }
 
     /// The same for variables whose fields are rejected.
-    #[cold]
-    #[inline(never)]
     fn withheld_lost(&mut self, vars: &InputSet) {
         for (group, nth) in self.withheld.groups() {
             let Some(port) = self.frames.get(usize::from(nth)).map(|frame| usize::from(frame.port)) else {

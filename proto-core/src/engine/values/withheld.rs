@@ -174,8 +174,6 @@ pub(crate) fn members(image: &Image, group: GroupId) -> InputSet {
 impl Store {
     /// These fields of a frame that is accepted are rejected: from now on they grow old on their own. Whether there is room;
     /// if not, nothing has changed.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn withhold(&mut self, nth: usize, rejected: &FieldSet) -> bool {
         let now = self.now;
         let Some(frame) = self.frames.get_mut(nth) else { return false };
@@ -212,8 +210,6 @@ impl Store {
     }
 
     /// These fields of a frame are accepted, perhaps again: they have its age.
-    #[cold]
-    #[inline(never)]
     pub(crate) fn readmit(&mut self, nth: usize, taken: &FieldSet) {
         let Some(frame) = self.frames.get_mut(nth) else { return };
         let id = nth as u8;

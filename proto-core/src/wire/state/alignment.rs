@@ -103,7 +103,6 @@ impl Earlier {
 
     /// Whether the bytes can be the connection's next packet; if so, their codes and position are
     /// remembered.
-    #[inline]
     pub(super) fn check(&mut self, bytes: &[u8; LEN]) -> Result<(), Misaligned> {
         let codes = codes(bytes);
         let is_as_before = self.codes == Some(codes);
@@ -121,8 +120,6 @@ impl Earlier {
     }
 
     /// The codes differ from the previous ones, or are the first.
-    #[cold]
-    #[inline(never)]
     fn check_change(&self, bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
         if self.codes.is_none() {
             return Ok(());
@@ -139,7 +136,6 @@ impl Earlier {
     }
 }
 
-#[inline]
 fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
     let joints: &[u8; JOINTS] = part(bytes, 0);
     let wrong = wrong_joints(joints);
@@ -157,8 +153,6 @@ fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
 
 /// The closer check. A shifted packet mostly has no codes, or all zeros, in place of a started
 /// controller's.
-#[cold]
-#[inline(never)]
 fn check_quantities(bytes: &[u8; LEN]) -> Result<(), Misaligned> {
     let wrong = bytes.as_chunks().0.iter().zip(&LIMITS).map(|(item, &most)| {
         let size = (u32::from_le_bytes(*item) & !SIGN) as i32;
@@ -184,12 +178,10 @@ fn is_started([mode, robot, program, safety]: [u8; 4]) -> bool {
     robot != 0 && safety > 1 && unknown.into_iter().filter(|unknown| *unknown).count() <= 1
 }
 
-#[inline]
 fn part<const N: usize>(bytes: &[u8; LEN], from: usize) -> &[u8; N] {
     bytes.get(from..).and_then(|bytes| bytes.first_chunk()).unwrap_or(&[0; N])
 }
 
-#[inline]
 fn wrong_joints(joints: &[u8; JOINTS]) -> u8 {
     joints.as_chunks().0.iter().map(|joint| u8::from(is_wrong_joint(joint))).sum()
 }
@@ -198,7 +190,6 @@ fn is_wrong_joint(joint: &[u8; 4]) -> bool {
     u32::from_le_bytes(*joint) & !SIGN > FARTHEST_RAD.to_bits()
 }
 
-#[cold]
 fn first_wrong_joint(joints: &[u8; JOINTS], wrong: u8) -> Misaligned {
     let mut named = (1..=6).zip(joints.as_chunks().0);
     let (joint, position) = named.find(|(_, bytes)| is_wrong_joint(bytes)).unwrap_or((0, &[0; 4]));
@@ -207,7 +198,6 @@ fn first_wrong_joint(joints: &[u8; JOINTS], wrong: u8) -> Misaligned {
 }
 
 /// Whether every bool is 0 or 1: checked many at a time, since nearly every packet is right.
-#[inline]
 fn are_bools(bytes: &[u8; LEN]) -> bool {
     let mut words = 0;
     for run in BOOL_BLOCKS {
@@ -218,8 +208,6 @@ fn are_bools(bytes: &[u8; LEN]) -> bool {
     words & u128::from_ne_bytes([0xFE; BLOCK]) == 0 && single & 0xFE == 0
 }
 
-#[cold]
-#[inline(never)]
 fn wrong_bools(bytes: &[u8; LEN]) -> u16 {
     let all = BOOLS.iter().filter_map(|run| bytes.get(run.from..)?.get(..run.len)).flatten();
     all.map(|&byte| u16::from(byte > 1)).sum()

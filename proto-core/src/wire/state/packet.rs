@@ -55,14 +55,12 @@ macro_rules! item {
             const TYPE: ScalarType = ScalarType::$scalar;
             const ZERO: Self = 0 as Self;
 
-            #[inline]
             fn read_all(items: &mut [Self], bytes: &[u8]) {
                 for (item, bytes) in items.iter_mut().zip(bytes.as_chunks::<$size>().0) {
                     *item = Self::from_le_bytes(*bytes);
                 }
             }
 
-            #[inline]
             fn write_all(items: &[Self], out: &mut [u8]) {
                 for (item, bytes) in items.iter().zip(out.as_chunks_mut::<$size>().0) {
                     *bytes = item.to_le_bytes();
@@ -91,12 +89,10 @@ impl<T: StateItem> StateField for T {
     const COUNT: u16 = 1;
     const ZERO: Self = T::ZERO;
 
-    #[inline]
     fn fill(&mut self, bytes: &[u8]) {
         T::read_all(core::slice::from_mut(self), bytes);
     }
 
-    #[inline]
     fn write(&self, out: &mut [u8]) {
         T::write_all(&[*self], out);
     }
@@ -107,12 +103,10 @@ impl<T: StateItem, const N: usize> StateField for [T; N] {
     const COUNT: u16 = N as u16;
     const ZERO: Self = [T::ZERO; N];
 
-    #[inline]
     fn fill(&mut self, bytes: &[u8]) {
         T::read_all(self, bytes);
     }
 
-    #[inline]
     fn write(&self, out: &mut [u8]) {
         T::write_all(self, out);
     }
@@ -288,7 +282,6 @@ packet! {
 
 impl StateView<'_> {
     /// The packet as a plain value.
-    #[inline]
     pub fn to_packet(&self) -> StatePacket {
         let mut packet = StatePacket::ZERO;
         packet.fill(self.as_bytes());
@@ -308,7 +301,6 @@ impl StatePacket {
     /// # Errors
     /// [`StateError`] if `bytes` is not as long as a packet. Its content is not judged; see
     /// [`StateView::check_alignment`].
-    #[inline]
     pub fn parse(bytes: &[u8]) -> Result<Self, StateError> {
         Ok(StateView::new(bytes)?.to_packet())
     }

@@ -74,7 +74,6 @@ impl StateStream {
     }
 
     /// Takes bytes that do not complete a packet. `false` if they do, or if there are none; then none were taken.
-    #[inline]
     pub(crate) fn hold(&mut self, chunk: &[u8]) -> bool {
         let held = self.pending();
         let end = held.saturating_add(chunk.len());

@@ -45,7 +45,6 @@ impl<'a> StateView<'a> {
     ///
     /// # Errors
     /// [`StateError`] when `bytes` are more or fewer.
-    #[inline]
     pub fn new(bytes: &'a [u8]) -> Result<Self, StateError> {
         match bytes.try_into() {
             Ok(bytes) => Ok(Self { bytes }),
