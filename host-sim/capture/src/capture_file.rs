@@ -170,7 +170,8 @@ mod tests {
     use proto_core::time::Instant;
 
     use super::*;
-    use crate::record::{Cell, CellPort, Epoch, Frame, Record, What};
+    use crate::frame::Frame;
+    use crate::record::{Cell, CellPort, Epoch, Record, What};
 
     fn deliver(watch: &Watch, frames: u64) {
         let port = CellPort { id: PortId(0), name: "line".into(), is_can: false, bit_rate: 0 };

@@ -14,7 +14,7 @@ use recipe_export::names::mangle;
 use recipe_export::{BusModel, Format, Model, describe_use, unit_of};
 use serde_json::{Map, Value, json};
 
-use crate::record::Frame;
+use crate::frame::Frame;
 
 /// Knows the frames of a file; by default of one that has none.
 #[derive(Debug, Clone, Default)]

@@ -9,6 +9,7 @@
 mod calls;
 mod capture_file;
 mod decode;
+mod frame;
 pub mod pcapng;
 mod record;
 pub mod recording;
@@ -19,5 +20,6 @@ mod watch;
 
 pub use capture_file::{CaptureFile, Target, replaceable};
 pub use decode::{Decoder, Topic};
-pub use record::{Cell, CellPort, Epoch, Frame, Record, What, rejection};
+pub use frame::{Frame, rejection};
+pub use record::{Cell, CellPort, Epoch, Record, What};
 pub use watch::{Arrived, Interest, Next, Subscription, Watch};

@@ -9,7 +9,8 @@ use std::sync::Arc;
 use proto_core::engine::{Rejection, TapDirection, TapPlace, TapVerdict};
 use proto_core::wire::can::CanId;
 
-use crate::record::{Cell, Frame, Record, What, rejection};
+use crate::frame::{Frame, rejection};
+use crate::record::{Cell, Record, What};
 use crate::watch::Arrived;
 
 /// The first bytes of every pcapng file.

@@ -4,11 +4,11 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use proto_core::config::{Bus, GatewayConfig};
-use proto_core::engine::{Engine, LinkId, PortId, TapDirection, TapPlace, TapVerdict};
+use proto_core::engine::{Engine, LinkId, PortId};
 use proto_core::time::Instant;
-use proto_core::wire::can::CanId;
 
 use crate::decode::Decoder;
+use crate::frame::Frame;
 
 /// One thing that was seen.
 #[derive(Debug, Clone)]
@@ -31,23 +31,6 @@ pub enum What {
     /// One call of the engine and what it did, as entries of a recording (`proto_core::record`); the first one
     /// of an engine is its start.
     Pass(Box<[u8]>),
-}
-
-/// A frame, bytes or a datagram at a port or link.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Frame {
-    /// The port or link.
-    pub place: TapPlace,
-    /// The direction.
-    pub direction: TapDirection,
-    /// Whether it was accepted.
-    pub verdict: TapVerdict,
-    /// Its id on CAN.
-    pub can_id: Option<CanId>,
-    /// Length in bytes; more than in `bytes` if that was cut.
-    pub len: usize,
-    /// The bytes.
-    pub bytes: Box<[u8]>,
 }
 
 /// A gateway's ports and links, its frames, and its clock.
@@ -128,14 +111,6 @@ impl Cell {
     /// The name of a link.
     pub fn link(&self, id: LinkId) -> Option<&str> {
         self.links.iter().find(|(other, _)| *other == id).map(|(_, name)| name.as_str())
-    }
-}
-
-/// Why a frame was rejected, in words; `None` if it was not.
-pub fn rejection(frame: &Frame) -> Option<&'static str> {
-    match frame.verdict {
-        TapVerdict::Rejected(why) => Some(why.text()),
-        _ => None,
     }
 }
 

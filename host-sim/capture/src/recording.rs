@@ -25,7 +25,8 @@ use proto_core::wire::can::CanId;
 use serde_json::{Value, json};
 use tracing::{info, warn};
 
-use crate::record::{Cell, Frame, Record, What, rejection};
+use crate::frame::{Frame, rejection};
+use crate::record::{Cell, Record, What};
 use crate::watch::{Arrived, Interest, Next, Subscription, Watch};
 use part::RecordingPart;
 

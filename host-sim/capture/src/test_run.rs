@@ -12,7 +12,8 @@ use recipe_export::Model;
 use recipe_test_kit::example;
 
 use crate::decode::Decoder;
-use crate::record::{Cell, Epoch, Frame, Record, What};
+use crate::frame::Frame;
+use crate::record::{Cell, Epoch, Record, What};
 use crate::watch::Watch;
 
 /// The file whose gateway runs: frames of five bytes on a serial line.

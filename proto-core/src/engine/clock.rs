@@ -1,9 +1,6 @@
 //! What every call looks at: the present, when the engine has to be called again, and what is to be asked then.
 
-use super::field::port::FieldPort;
 use super::io::Output;
-use super::link::links::LinksView;
-use super::values::store::Store;
 use crate::time::{Duration, Instant};
 
 /// If two calls of the engine are further apart than this, the gateway was asleep: stopped,
@@ -174,26 +171,4 @@ impl Dirty {
     pub(super) const fn when(self, wanted: bool) -> Self {
         if wanted { self } else { Self::NONE }
     }
-}
-
-/// When the engine has something to do without an input, computed exactly: without partial frames, and of these.
-pub(super) fn deadlines(
-    clock: &Clock,
-    ports: &[FieldPort],
-    links: LinksView<'_>,
-    store: &Store,
-    has_exchanges: bool,
-) -> (Instant, Instant) {
-    let mut firm = links.deadline().min(store.deadline());
-    if clock.has_slept {
-        firm = firm.min(clock.slept_until);
-    }
-    let mut partial = Instant::NEVER;
-    for port in ports {
-        (firm, partial) = (firm.min(port.send_deadline()), partial.min(port.partial_until()));
-        if has_exchanges && !clock.has_slept {
-            firm = firm.min(port.exchange_deadline());
-        }
-    }
-    (firm, partial)
 }

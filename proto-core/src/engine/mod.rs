@@ -12,6 +12,7 @@
 //! Errors of a device or of the controller are counted and skipped. They are never an error of the
 //! run loop. Nothing is applied in part, but for frames of devices, whose fields are judged one by one.
 
+mod build_error;
 mod clock;
 mod counters;
 mod dispatch;
@@ -27,6 +28,7 @@ mod status_serde;
 mod tap;
 mod values;
 
+pub use build_error::{BuildError, PlanError};
 pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
 pub use field::events::Outcome;
@@ -40,16 +42,17 @@ pub use link::dropped::{DropReason, DroppedCommand};
 pub use link::failed::FailedCommand;
 pub use link::links::LinkInfo;
 pub use link::other_text::{MAX_OTHER_TEXT, OtherText};
+pub use link::state::ControllerStatus;
 pub use link::stops::COMMAND_QUEUE;
-pub use plan::error::BuildError;
-pub use plan::routes::{Plan, PlanError, Route, Source};
+pub use plan::routes::{Plan, Route, Source};
 pub use rejection::{KEPT_BYTES, LastRejection, RejectedField, Rejection};
-pub use status::{ControllerStatus, FieldBus, Health, PeerStatus, PortStatus, Status, VariableStatus};
+pub use status::{FieldBus, Health, PeerStatus, PortStatus, Status, VariableStatus};
 pub use tap::{MAX_TAPPED, TAP_OVERHEAD, Tap, TapDirection, TapPlace, TapRecord, TapVerdict};
 
 use heapless::{String, Vec};
 
-use clock::{Clock, deadlines};
+use clock::Clock;
+use dispatch::time::deadlines;
 use dispatch::{EngineView, hold};
 use field::bindings::{Bindings, InputBind, OutputBind, Sendable};
 use field::exchanges::{ExchangeItem, Exchanges, Piece};
@@ -63,8 +66,9 @@ use link::links::{Links, LinksView, MAX_HOST, Maybe};
 use link::modbus::ModbusLink;
 use link::recipe::Uplink;
 use link::state::StateLink;
+use values::bits::SafeBytes;
 use values::outbox::EdgeQueue;
-use values::store::{SafeBytes, Store};
+use values::store::Store;
 
 use crate::config::{ConfigView, MAX_EXCHANGES, MAX_SAFE_VALUES, MAX_SENDABLE};
 use crate::image::Image;

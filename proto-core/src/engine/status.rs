@@ -19,6 +19,7 @@ use super::latency::Latency;
 use super::link::dropped::DroppedCommand;
 use super::link::failed::FailedCommand;
 use super::link::links::{LinkInfo, LinksView};
+use super::link::state::ControllerStatus;
 use super::rejection::{LastRejection, RejectedField};
 use super::values::bits::Bits;
 use super::values::store::InputFrame;
@@ -29,7 +30,6 @@ use crate::schedule::Presence;
 use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
-use crate::wire::state::States;
 
 /// State and counters of a gateway at one instant; made by [`super::Engine::status`].
 #[derive(Debug, Clone, Copy)]
@@ -197,16 +197,6 @@ impl fmt::Display for Name {
             None => self.var.fmt(f),
         }
     }
-}
-
-/// The controller's states in the newest state packet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub struct ControllerStatus {
-    /// Mode, and robot, program and safety state.
-    pub states: States,
-    /// Time since that packet.
-    pub age: Duration,
 }
 
 impl<'a> Status<'a> {

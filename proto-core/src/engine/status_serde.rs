@@ -24,8 +24,9 @@ use super::link::dropped::DroppedCommand;
 use super::link::failed::FailedCommand;
 use super::link::links::LinkInfo;
 use super::link::other_text::OtherText;
+use super::link::state::ControllerStatus;
 use super::rejection::{LastRejection, RejectedField};
-use super::status::{ControllerStatus, FieldBus, PeerStatus, PortStatus, Status, VariableStatus};
+use super::status::{FieldBus, PeerStatus, PortStatus, Status, VariableStatus};
 use crate::time::Instant;
 use crate::wire::scalar::Scalar;
 

@@ -6,7 +6,7 @@ mod device_links;
 mod exchanges;
 mod health;
 mod links;
-mod time;
+pub(crate) mod time;
 
 use heapless::{Vec, VecView};
 
@@ -23,7 +23,8 @@ use crate::engine::field::port::{FieldPort, find_port};
 use crate::engine::io::{BusState, Handled, Input, Output, PortId};
 use crate::engine::link::links::Links;
 use crate::engine::tap::{Tap, TapPlace};
-use crate::engine::values::store::{SafeBytes, Store};
+use crate::engine::values::bits::SafeBytes;
+use crate::engine::values::store::Store;
 use crate::link::LinkAction;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;

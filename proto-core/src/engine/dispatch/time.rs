@@ -4,13 +4,37 @@
 //! know what the deadlines are for.
 
 use super::EngineView;
-use crate::engine::clock::{AFTER_SLEEP, ASLEEP, Dirty, HEARTBEAT, deadlines};
+use crate::engine::clock::{AFTER_SLEEP, ASLEEP, Clock, Dirty, HEARTBEAT};
 use crate::engine::counters::{add, bump};
 use crate::engine::field::bindings::silence_commands;
 use crate::engine::field::port::FieldPort;
 use crate::engine::io::{Handled, Output};
+use crate::engine::link::links::LinksView;
 use crate::engine::values::store::Overdue;
+use crate::engine::values::store::Store;
 use crate::time::{Duration, Instant};
+
+/// When the engine has something to do without an input, computed exactly: without partial frames, and of these.
+pub(crate) fn deadlines(
+    clock: &Clock,
+    ports: &[FieldPort],
+    links: LinksView<'_>,
+    store: &Store,
+    has_exchanges: bool,
+) -> (Instant, Instant) {
+    let mut firm = links.deadline().min(store.deadline());
+    if clock.has_slept {
+        firm = firm.min(clock.slept_until);
+    }
+    let mut partial = Instant::NEVER;
+    for port in ports {
+        (firm, partial) = (firm.min(port.send_deadline()), partial.min(port.partial_until()));
+        if has_exchanges && !clock.has_slept {
+            firm = firm.min(port.exchange_deadline());
+        }
+    }
+    (firm, partial)
+}
 
 impl EngineView<'_> {
     /// The deadlines up to `now` pass.

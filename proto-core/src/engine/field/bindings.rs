@@ -2,7 +2,6 @@
 
 use heapless::{Vec, VecView};
 
-use super::rules::Rule;
 use crate::config::{FieldSpec, Limits, MAX_SENDABLE, MapEntry, OutputBinding, Span};
 use crate::device::{Element, Encoding, Length, Overflow, Text, wrap};
 use crate::engine::io::ReplyCode;
@@ -69,6 +68,69 @@ impl InputBind {
             InputTo::Fixed { high, low } => i64::from(high).unbounded_shl(32) | i64::from(low),
             _ => 0,
         })
+    }
+}
+
+/// One word of a rule: what it is, and the halves of a number.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Rule {
+    pub is: Is,
+    /// As bytes, which need no alignment: a binding stays small.
+    bits: [u8; 8],
+}
+
+/// What a word is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Is {
+    /// Scale and offset.
+    Scale,
+    /// The variable has the number in two's complement.
+    TwosComplement,
+    /// The lowest number; another one is rejected.
+    Low,
+    /// The highest number.
+    High,
+    /// Another number becomes the nearest limit.
+    Clamps,
+    /// The first value of an entry.
+    First,
+    /// The last one.
+    Last,
+    /// What the variable becomes for them.
+    Becomes,
+    /// What it becomes for all others.
+    Else,
+    /// A number that says that there is none.
+    NoNumber,
+    /// The same of a text of so many characters, eight in a word.
+    NoText(u8),
+    /// The digits have a comma for a point.
+    Comma,
+    /// This variable, or these bits of it, tells whether a value was taken.
+    ValidTo,
+}
+
+impl Rule {
+    pub(crate) const fn new(is: Is, number: u64) -> Self {
+        Self { is, bits: number.to_be_bytes() }
+    }
+
+    pub(crate) const fn bits(self) -> u64 {
+        u64::from_be_bytes(self.bits)
+    }
+
+    pub(crate) const fn number(self) -> f64 {
+        f64::from_bits(self.bits())
+    }
+
+    /// Its two halves.
+    pub(crate) const fn halves(self) -> [u32; 2] {
+        [self.bits().unbounded_shr(32) as u32, self.bits() as u32]
+    }
+
+    pub(crate) fn to_bind(self) -> InputBind {
+        // It is in no frame.
+        InputBind::new(InputTo::Rule(self), Element::Padding { len: 0, fill: 0 })
     }
 }
 

@@ -7,7 +7,7 @@
 
 use heapless::Vec;
 
-use super::bindings::{InputBind, InputTo, Written};
+use super::bindings::{InputBind, InputTo, Is, Rule, Written};
 use crate::config::{
     FieldSpec, InputBinding, InputRule, Limits, MapEntry, NO_TEXT, Outside, fitting_numbers,
 };
@@ -16,69 +16,6 @@ use crate::engine::rejection::Rejection;
 use crate::image::{bind_to_variable, round};
 use crate::sysvar::SysVar;
 use crate::wire::scalar::{Scalar, ScalarType};
-
-/// One word of a rule: what it is, and the halves of a number.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Rule {
-    is: Is,
-    /// As bytes, which need no alignment: a binding stays small.
-    bits: [u8; 8],
-}
-
-/// What a word is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Is {
-    /// Scale and offset.
-    Scale,
-    /// The variable has the number in two's complement.
-    TwosComplement,
-    /// The lowest number; another one is rejected.
-    Low,
-    /// The highest number.
-    High,
-    /// Another number becomes the nearest limit.
-    Clamps,
-    /// The first value of an entry.
-    First,
-    /// The last one.
-    Last,
-    /// What the variable becomes for them.
-    Becomes,
-    /// What it becomes for all others.
-    Else,
-    /// A number that says that there is none.
-    NoNumber,
-    /// The same of a text of so many characters, eight in a word.
-    NoText(u8),
-    /// The digits have a comma for a point.
-    Comma,
-    /// This variable, or these bits of it, tells whether a value was taken.
-    ValidTo,
-}
-
-impl Rule {
-    const fn new(is: Is, number: u64) -> Self {
-        Self { is, bits: number.to_be_bytes() }
-    }
-
-    const fn bits(self) -> u64 {
-        u64::from_be_bytes(self.bits)
-    }
-
-    const fn number(self) -> f64 {
-        f64::from_bits(self.bits())
-    }
-
-    /// Its two halves.
-    const fn halves(self) -> [u32; 2] {
-        [self.bits().unbounded_shr(32) as u32, self.bits() as u32]
-    }
-
-    fn to_bind(self) -> InputBind {
-        // It is in no frame.
-        InputBind::new(InputTo::Rule(self), Element::Padding { len: 0, fill: 0 })
-    }
-}
 
 /// The words of what stands behind a field.
 pub(crate) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + use<> {

@@ -7,7 +7,7 @@
 
 use heapless::{Deque, Vec};
 
-use super::command_tables::{CommandField, Entry, MAX_COMMAND_FIELDS, Picked, Tables, is_asked};
+use super::command_tables::{CommandField, Entry, Picked, Tables, is_asked};
 use super::dropped::{DropReason, DroppedCommand};
 use super::failed::FailedCommands;
 use super::other_text::OtherText;
@@ -17,6 +17,7 @@ use super::stops::{COMMAND_QUEUE, STOP_TTL, Stops, Waiting};
 use crate::command::Keyword;
 use crate::config::{CommandEntry, CommandText, CommandWhen, MAX_PORTS, Span, fill_in};
 use crate::engine::io::{LinkId, PortId, ReplyCode, Transport};
+use crate::engine::values::withheld::MAX_COMMAND_FIELDS;
 use crate::link::LinkState;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;

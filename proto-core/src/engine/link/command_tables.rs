@@ -10,8 +10,6 @@ use crate::command::{Keyword, Request};
 use crate::config::{CommandEntry, CommandWhen, MAX_COMMANDS, Span, placeholders};
 use crate::engine::io::ReplyCode;
 
-/// Fields bound to command tables, over all ports.
-pub(crate) const MAX_COMMAND_FIELDS: usize = 16;
 /// Bytes of command texts, over all tables.
 pub(crate) const MAX_COMMAND_BYTES: usize = 1024;
 

@@ -1,10 +1,10 @@
 //! Commands that the controller replied to with a failure, and the controller's states at that moment:
 //! a reply of port 2000 says only that it failed.
 
+use super::state::ControllerStatus;
 use super::stops::Waiting;
 use crate::config::{CommandText, MAX_PORTS};
 use crate::engine::io::{PortId, ReplyCode};
-use crate::engine::status::ControllerStatus;
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 

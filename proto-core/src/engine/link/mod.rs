@@ -9,7 +9,6 @@ pub(crate) mod failed;
 pub(crate) mod flight;
 pub(crate) mod links;
 pub(crate) mod modbus;
-pub(crate) mod modbus_poll;
 pub(crate) mod other_text;
 pub(crate) mod outcome;
 pub(crate) mod recipe;

@@ -5,7 +5,6 @@ use heapless::Vec;
 
 use super::connection::Connection;
 use super::flight::Flight;
-use super::modbus_poll::take_poll;
 use crate::engine::OUTPUT_BUFFER;
 use crate::engine::counters::{LinkCounters, bump};
 use crate::engine::io::Transport;
@@ -15,11 +14,12 @@ use crate::image::{BitSet, GroupId, InputSet};
 use crate::link::{LinkTimings, Supervisor};
 use crate::modbus::adu::MAX_ADU;
 use crate::modbus::client::{Client, ClientEvent};
-use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request};
+use crate::modbus::pdu::{MAX_WRITE_COILS, MAX_WRITE_REGISTERS, Request, Response};
 use crate::modbus::{Coils, Registers};
 use crate::schedule::Grid;
 use crate::sysvar::{BIT_INPUT_COUNT, ModbusPlace, SysVar};
 use crate::time::{Duration, Instant};
+use crate::wire::scalar::Scalar;
 
 /// Blocks of neighbouring coils or registers that are polled together.
 pub(crate) const MAX_POLL_BLOCKS: usize = 16;
@@ -559,4 +559,58 @@ fn place_of(var: SysVar) -> Option<(u16, Kind)> {
         ModbusPlace::Register { address } => Some((address, Kind::Registers)),
         ModbusPlace::Scaled { .. } => None,
     }
+}
+
+/// Writes the answer to a poll into the image.
+pub(crate) fn take_poll(block: &Block, polled: &[SysVar], response: Response<'_>, store: &mut Store) {
+    if store.bits.is_used {
+        take_values_beside_bits(block, polled, response, store);
+    } else {
+        take_values(block, polled, response, |var, value| {
+            // The table gives the variable's type, and bits beyond it were not read.
+            let _ = store.image.set(var, value);
+        });
+    }
+    store.image.stamp(block.group, store.now);
+    store.unconfirm_by_witnesses();
+}
+
+/// The same where bits have owners.
+fn take_values_beside_bits(block: &Block, polled: &[SysVar], response: Response<'_>, store: &mut Store) {
+    take_values(block, polled, response, |var, value| match value {
+        Scalar::Byte(shown) if store.bits.bytes.contains(var) => store.show_bits(var, shown),
+        value => _ = store.image.set(var, value),
+    });
+}
+
+fn take_values(
+    block: &Block,
+    polled: &[SysVar],
+    response: Response<'_>,
+    mut take: impl FnMut(SysVar, Scalar),
+) {
+    for &var in polled {
+        let value = match (var.modbus(), response) {
+            (Some(ModbusPlace::Coils { first, count }), Response::Coils(coils)) => {
+                (block.kind == Kind::Coils).then(|| bits_at(coils, first, count, block)).flatten()
+            }
+            (Some(ModbusPlace::Register { address }), Response::Registers(registers)) => {
+                let nth = address.checked_sub(block.first).filter(|_| block.kind == Kind::Registers);
+                nth.and_then(|nth| registers.register(nth)).map(Scalar::Word)
+            }
+            _ => None,
+        };
+        if let Some(value) = value {
+            take(var, value);
+        }
+    }
+}
+
+fn bits_at(coils: Coils<'_>, first: u16, count: u16, block: &Block) -> Option<Scalar> {
+    let start = first.checked_sub(block.first)?;
+    let mut bits = 0_u8;
+    for nth in 0..count.min(8) {
+        bits |= u8::from(coils.coil(start.saturating_add(nth))?).checked_shl(u32::from(nth))?;
+    }
+    Some(Scalar::Byte(bits))
 }

@@ -14,7 +14,18 @@ use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 use crate::wire::runs::{MAX_RUN, all_finite, copy};
 use crate::wire::scalar::{Scalar, ScalarType};
+use crate::wire::state::States;
 use crate::wire::state::{StateStream, StateView};
+
+/// The controller's states in the newest state packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct ControllerStatus {
+    /// Mode, and robot, program and safety state.
+    pub states: States,
+    /// Time since that packet.
+    pub age: Duration,
+}
 
 /// A stream that is silent for this long is reopened: twenty packets are missing.
 const SILENCE: Duration = Duration::from_secs(2);

@@ -5,13 +5,13 @@ use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 use heapless::Vec;
 
 use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
-use super::error::{BuildError, one_too_many};
 use super::exchanges::Places;
 use super::routes::{Plan, Route, Source, sent_by, shown_by, uplinks};
 use crate::config::{
     Bus, ConfigView, Counted, FieldSpec, InputBinding, InputRule, MAX_SAFE_VALUES, MAX_SENDABLE, MIN_CYCLE,
     OutputBinding, Parts, Port, Recipe, SendOn, Span, listen_address,
 };
+use crate::engine::build_error::{BuildError, one_too_many};
 use crate::engine::counters::PortCounters;
 use crate::engine::dispatch::EngineView;
 use crate::engine::field::bindings::{InputBind, InputTo, OutputBind, Sendable};
@@ -22,15 +22,17 @@ use crate::engine::field::rules::{scale_word, words_of};
 use crate::engine::field::sender::Sender;
 use crate::engine::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
 use crate::engine::link::command::CommandLink;
-use crate::engine::link::command_tables::{MAX_COMMAND_BYTES, MAX_COMMAND_FIELDS};
+use crate::engine::link::command_tables::MAX_COMMAND_BYTES;
 use crate::engine::link::device::DeviceLink;
 use crate::engine::link::modbus::{MAX_POLL_BLOCKS, ModbusLink};
 use crate::engine::link::recipe::{Uplink, UplinkSetup};
 use crate::engine::link::state::StateLink;
 use crate::engine::values::bits::MAX_SHARES;
+use crate::engine::values::bits::SafeBytes;
 use crate::engine::values::counts::MAX_COUNTS;
 use crate::engine::values::outbox::EdgeQueue;
-use crate::engine::values::store::{InputFrame, MAX_INPUT_FRAMES, SafeBytes};
+use crate::engine::values::store::{InputFrame, MAX_INPUT_FRAMES};
+use crate::engine::values::withheld::MAX_COMMAND_FIELDS;
 use crate::image::{GroupId, InputSet, MAX_GROUPS};
 use crate::link::LinkTimings;
 use crate::recipe::model::Framing;

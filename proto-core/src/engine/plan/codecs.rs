@@ -1,8 +1,8 @@
 //! The layouts of a port's recipe, from the configuration. Those of devices' frames are made in
 //! `device_port`.
 
-use super::error::BuildError;
 use crate::config::{CanFramePart, ConfigView, FieldSpec, Recipe, StreamPart};
+use crate::engine::build_error::BuildError;
 use crate::engine::field::port::Codec;
 use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, Deframer, StreamLayout};

@@ -1,11 +1,11 @@
 //! The exchanges of a port, from the configuration.
 
-use super::error::{BuildError, one_too_many};
 use crate::config::{
     Bus, ConfigView, Counted, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, OutcomeTo, Port, Recipe,
     Span, Transaction, has_values,
 };
 use crate::device::{Carrier, LayoutError};
+use crate::engine::build_error::{BuildError, one_too_many};
 use crate::engine::dispatch::EngineView;
 use crate::engine::field::bindings::{InputBind, InputTo};
 use crate::engine::field::device::DeviceFormat;

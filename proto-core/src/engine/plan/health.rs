@@ -1,8 +1,8 @@
 //! The health of ports and links that a configuration shows: places among extra values, and variables.
 
 use super::build::Groups;
-use super::error::{BuildError, one_too_many};
 use crate::config::{ConfigView, Counted, LinkSource, OutputBinding};
+use crate::engine::build_error::{BuildError, one_too_many};
 use crate::engine::dispatch::EngineView;
 use crate::engine::field::health::{HealthVariable, Of, Shown};
 use crate::engine::io::{LinkId, PortId};

@@ -2,7 +2,6 @@
 
 pub(crate) mod build;
 pub(crate) mod codecs;
-pub(crate) mod error;
 pub(crate) mod exchanges;
 pub(crate) mod health;
 pub(crate) mod routes;

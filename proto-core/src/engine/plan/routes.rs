@@ -3,7 +3,7 @@
 //! In: a configuration. Out: the owner and way up of every input variable, and the source of every
 //! variable that a port shows. Decided once; it does not change while the engine runs.
 
-use core::fmt;
+use crate::engine::build_error::PlanError;
 
 use crate::config::{ConfigView, FieldSpec, Recipe, SendOn};
 use crate::engine::io::{LinkId, PortId};
@@ -43,104 +43,6 @@ pub struct Plan {
     bit_owners: [[Option<PortId>; 8]; BIT_INPUT_COUNT],
     shows_state: bool,
 }
-
-/// Why a variable has no way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum PlanError {
-    /// Two ports write the same input variable.
-    TwoOwners {
-        /// The variable.
-        var: SysVar,
-        /// The port that writes it first.
-        first: PortId,
-        /// The other.
-        second: PortId,
-    },
-    /// Two ports write the same bit.
-    TwoBitOwners {
-        /// The bit.
-        bit: VarBit,
-        /// The port that writes it first.
-        first: PortId,
-        /// The other.
-        second: PortId,
-    },
-    /// One port writes the whole variable, and another one of its bits.
-    OwnedAndShared {
-        /// The bit.
-        bit: VarBit,
-        /// The port that writes the variable.
-        whole: PortId,
-        /// The port that writes the bit.
-        part: PortId,
-    },
-    /// No configured way up can carry the input variable (D15).
-    NoRoute {
-        /// The variable.
-        var: SysVar,
-        /// The port that writes it.
-        port: PortId,
-    },
-    /// No configured source has the variable that a port shows (D15).
-    NoSource {
-        /// The variable.
-        var: SysVar,
-        /// The port that shows it.
-        port: PortId,
-    },
-    /// A recipe link's frame carries a variable that no port sends and that cannot be read back:
-    /// its value would have to be invented.
-    NobodySends {
-        /// The variable.
-        var: SysVar,
-        /// The recipe link.
-        link: LinkId,
-    },
-}
-
-impl fmt::Display for PlanError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::TwoOwners { var, first, second } => {
-                write!(
-                    f,
-                    "{var} is written by port {} and by port {}; a variable has one owner",
-                    first.0, second.0
-                )
-            }
-            Self::TwoBitOwners { bit, first, second } => {
-                write!(
-                    f,
-                    "{bit} is written by port {} and by port {}; a bit has one owner",
-                    first.0, second.0
-                )
-            }
-            Self::OwnedAndShared { bit, whole, part } => {
-                write!(
-                    f,
-                    "{} is written by port {} as a whole, and {bit} by port {}; allowed: one owner of the whole, \
-                     or owners of bits",
-                    bit.var, whole.0, part.0
-                )
-            }
-            Self::NoRoute { var, .. } => {
-                write!(f, "{var} can be written only through a recipe link whose input part carries it")
-            }
-            Self::NoSource { var, .. } => {
-                write!(f, "{var} can be read only through a recipe link whose output part carries it")
-            }
-            Self::NobodySends { var, .. } => {
-                write!(
-                    f,
-                    "{var} is in the recipe link's frame, but no port sends it and it cannot be read back"
-                )
-            }
-        }
-    }
-}
-
-impl core::error::Error for PlanError {}
 
 impl Plan {
     /// Makes the plan of a configuration.

@@ -12,11 +12,29 @@
 use heapless::Vec;
 
 use super::outbox::{EdgeQueue, Offer};
-use super::store::SafeBytes;
+use crate::config::SafeValue;
 use crate::engine::counters::{PortCounters, add, bump};
 use crate::image::{BitSet, GroupId, Image, InputSet};
 use crate::sysvar::{INPUT_COUNT, SysVar, VarBit};
 use crate::time::{Duration, Instant};
+
+/// A safe value in the form of the image.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SafeBytes {
+    pub var: SysVar,
+    pub bytes: [u8; 4],
+    /// The bits of a byte that it is for.
+    pub mask: u8,
+}
+
+impl SafeBytes {
+    pub(crate) fn new(safe: &SafeValue) -> Self {
+        let mut bytes = [0; 4];
+        // Every variable has at most four bytes, and validation has checked the type.
+        safe.value.encode(&mut bytes);
+        Self { var: safe.var, bytes, mask: safe.mask }
+    }
+}
 
 /// Maximum number of shares over all input frames.
 pub(crate) const MAX_SHARES: usize = 32;

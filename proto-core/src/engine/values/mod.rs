@@ -4,5 +4,6 @@ pub(crate) mod bits;
 pub(crate) mod confirmed;
 pub(crate) mod counts;
 pub(crate) mod outbox;
+pub(crate) mod rejected;
 pub(crate) mod store;
 pub(crate) mod withheld;

@@ -3,16 +3,15 @@
 
 use heapless::{Vec, VecView};
 
-use super::bits::{Bits, TimedOut};
+use super::bits::{Bits, SafeBytes, TimedOut};
 use super::counts::Counts;
 use super::outbox::{EdgeQueue, Outbox};
 use super::withheld::{Withheld, members};
-use crate::config::{SafeValue, Span};
+use crate::config::Span;
 use crate::engine::counters::{PortCounters, add, bump};
 use crate::engine::latency::Latency;
 use crate::engine::rejection::FieldRejection;
 use crate::image::{BitSet, GroupId, Image, InputSet};
-use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant, Stamp};
 
 /// Maximum number of input frames over all field ports: a stream recipe has one, a CAN recipe one
@@ -54,24 +53,6 @@ pub(crate) enum Overdue {
     Command(u8),
     /// What the robot is told about the health of ports.
     Health,
-}
-
-/// A safe value in the form of the image.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct SafeBytes {
-    pub var: SysVar,
-    pub bytes: [u8; 4],
-    /// The bits of a byte that it is for.
-    pub mask: u8,
-}
-
-impl SafeBytes {
-    pub(crate) fn new(safe: &SafeValue) -> Self {
-        let mut bytes = [0; 4];
-        // Every variable has at most four bytes, and validation has checked the type.
-        safe.value.encode(&mut bytes);
-        Self { var: safe.var, bytes, mask: safe.mask }
-    }
 }
 
 #[derive(Debug, Clone)]

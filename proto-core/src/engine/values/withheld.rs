@@ -7,19 +7,20 @@
 //! time after the same frame share a group.
 
 use super::bits::Bits;
-use super::store::Store;
-use crate::engine::link::command_tables::MAX_COMMAND_FIELDS;
 use crate::image::{GroupId, Image, InputSet, MAX_GROUPS, WITHHELD_GROUPS};
 use crate::time::{Instant, Stamp};
 
+/// Fields bound to command tables, over all ports.
+pub(crate) const MAX_COMMAND_FIELDS: usize = 16;
+
 /// Number of groups that still have their time.
-const WAITING: usize = WITHHELD_GROUPS - 2;
+pub(super) const WAITING: usize = WITHHELD_GROUPS - 2;
 /// The group of fields whose time is over and that have lost their own group to others: as old as the oldest of them.
 const LONG_AGO: GroupId = group_of(WAITING);
 /// The same of fields that have never had a value.
 const UNKNOWN: GroupId = group_of(WAITING + 1);
 
-const fn group_of(nth: usize) -> GroupId {
+pub(super) const fn group_of(nth: usize) -> GroupId {
     GroupId(MAX_GROUPS.saturating_add(nth) as u8)
 }
 
@@ -54,11 +55,11 @@ impl FieldSet {
 #[derive(Debug, Clone)]
 pub(crate) struct Withheld {
     /// When each group is overdue; [`Instant::NEVER`] after that.
-    overdue_at: [Stamp; WAITING],
+    pub(super) overdue_at: [Stamp; WAITING],
     /// The frame of each group, by its index in the store.
-    frames: [u8; WAITING],
+    pub(super) frames: [u8; WAITING],
     /// Of each command field that is rejected, one more than the number of its group; of others 0.
-    commands: [u8; MAX_COMMAND_FIELDS],
+    pub(super) commands: [u8; MAX_COMMAND_FIELDS],
     /// Whether there is any.
     pub is_used: bool,
 }
@@ -109,13 +110,13 @@ impl Withheld {
         Some(field)
     }
 
-    fn command_groups(&self) -> impl Iterator<Item = GroupId> + '_ {
+    pub(super) fn command_groups(&self) -> impl Iterator<Item = GroupId> + '_ {
         self.commands.iter().filter_map(|group| group.checked_sub(1)).map(GroupId)
     }
 
     /// The group for fields of this frame whose last value came at `since`; `None` if all are in use by fields that still
     /// have their time.
-    fn group(
+    pub(super) fn group(
         &mut self,
         (frame, since): (u8, Option<Instant>),
         overdue_at: Instant,
@@ -169,70 +170,4 @@ impl Withheld {
 /// The variables of a group.
 pub(crate) fn members(image: &Image, group: GroupId) -> InputSet {
     image.withheld().iter().filter(|&var| image.group(var) == Some(group)).collect()
-}
-
-impl Store {
-    /// These fields of a frame that is accepted are rejected: from now on they grow old on their own. Whether there is room;
-    /// if not, nothing has changed.
-    pub(crate) fn withhold(&mut self, nth: usize, rejected: &FieldSet) -> bool {
-        let now = self.now;
-        let Some(frame) = self.frames.get_mut(nth) else { return false };
-        let id = nth as u8;
-        let since = self.image.stamp_of(GroupId(id));
-        let overdue_at = match since {
-            Some(at) if frame.overdue_at != Instant::NEVER => at + frame.timeout,
-            // It was overdue together with its frame.
-            Some(_) => Instant::NEVER,
-            None if frame.overdue_at == Instant::ZERO => Instant::ZERO,
-            // It has never had a value; this is the first frame that should have brought one.
-            None => now + frame.timeout,
-        };
-        let whole = rejected.whole.and(&frame.set).minus(&self.bits.bytes);
-        let has_bits = self.bits.has_unwithheld(id, &rejected.bits);
-        // A command field without a value has no base that it could lose.
-        let has_commands = since.is_some() && overdue_at != Instant::NEVER;
-        let is_command = move |(field, group): &(u32, &mut u8)| {
-            has_commands && **group == 0 && rejected.commands.checked_shr(*field).unwrap_or(0) & 1 == 1
-        };
-        let has_commands = (0..).zip(&mut self.withheld.commands).any(|command| is_command(&command));
-        if !whole.is_empty() || has_bits || has_commands {
-            let group = self.withheld.group((id, since), overdue_at, &mut self.image, &mut self.bits);
-            let Some(group) = group else { return false };
-            frame.set = frame.set.minus(&whole);
-            whole.iter().for_each(|var| self.image.withhold(var, group));
-            self.bits.withhold(id, &rejected.bits, group);
-            let commands = (0..).zip(&mut self.withheld.commands).filter(is_command);
-            commands.for_each(|(_, own)| *own = group.0.saturating_add(1));
-            self.next_overdue.or_earlier(overdue_at);
-        }
-        self.withheld.is_used = true;
-        true
-    }
-
-    /// These fields of a frame are accepted, perhaps again: they have its age.
-    pub(crate) fn readmit(&mut self, nth: usize, taken: &FieldSet) {
-        let Some(frame) = self.frames.get_mut(nth) else { return };
-        let id = nth as u8;
-        for var in taken.whole.and(&self.image.withheld()).iter() {
-            frame.set.insert(var);
-            self.image.readmit(var, GroupId(id));
-        }
-        self.bits.readmit(id, &taken.bits);
-        for (field, group) in (0..).zip(&mut self.withheld.commands) {
-            if taken.commands.checked_shr(field).unwrap_or(0) & 1 == 1 {
-                *group = 0;
-            }
-        }
-        for nth in 0..WAITING {
-            let group = group_of(nth);
-            let is_empty = members(&self.image, group).is_empty()
-                && self.bits.withheld_groups().chain(self.withheld.command_groups()).all(|own| own != group);
-            if let Some(at) = self.withheld.overdue_at.get_mut(nth).filter(|_| is_empty) {
-                *at = Stamp::NEVER;
-            }
-        }
-        self.withheld.is_used = !self.image.withheld().is_empty()
-            || self.bits.withheld_groups().next().is_some()
-            || self.withheld.command_groups().next().is_some();
-    }
 }

@@ -1,0 +1,29 @@
+//! One frame that was seen.
+
+use proto_core::engine::{TapDirection, TapPlace, TapVerdict};
+use proto_core::wire::can::CanId;
+
+/// A frame, bytes or a datagram at a port or link.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Frame {
+    /// The port or link.
+    pub place: TapPlace,
+    /// The direction.
+    pub direction: TapDirection,
+    /// Whether it was accepted.
+    pub verdict: TapVerdict,
+    /// Its id on CAN.
+    pub can_id: Option<CanId>,
+    /// Length in bytes; more than in `bytes` if that was cut.
+    pub len: usize,
+    /// The bytes.
+    pub bytes: Box<[u8]>,
+}
+
+/// Why a frame was rejected, in words; `None` if it was not.
+pub fn rejection(frame: &Frame) -> Option<&'static str> {
+    match frame.verdict {
+        TapVerdict::Rejected(why) => Some(why.text()),
+        _ => None,
+    }
+}
