@@ -48,6 +48,71 @@ fn matches_text(path: &Path, said: &str) {
     }
 }
 
+/// The variants or fields of each public type of this name, in their order.
+fn names_in_source(sources: &[String], name: &str) -> Vec<Vec<String>> {
+    let name_of = |line: &str| -> String {
+        let line = line.strip_prefix("pub ").unwrap_or(line);
+        line.chars().take_while(|next| next.is_alphanumeric() || *next == '_').collect()
+    };
+    let mut found = Vec::new();
+    for source in sources {
+        for kind in ["enum", "struct"] {
+            let head = format!("\npub {kind} {name}");
+            for (at, _) in source.match_indices(&head) {
+                let rest = &source[at + head.len()..];
+                if rest.starts_with(|next: char| next.is_alphanumeric() || next == '(') {
+                    continue;
+                }
+                // What stands four blanks in, at the beginning of a line.
+                let body = rest.split_once("{\n").and_then(|(_, body)| body.split_once("\n}")).unwrap().0;
+                let own = body.lines().filter_map(|line| line.strip_prefix("    "));
+                let own = own.filter(|line| line.starts_with(|first: char| first.is_alphabetic()));
+                found.push(own.map(name_of).collect());
+            }
+        }
+    }
+    found
+}
+
+/// An image holds variants by their number and fields by their place. Whoever sorts them, or puts a new one between,
+/// makes boards read other things from the images that they have.
+#[test]
+fn variants_and_fields_stand_in_the_order_of_the_newest_version() {
+    let mut sources = Vec::new();
+    let mut folders = vec![Path::new(env!("CARGO_MANIFEST_DIR")).join("src")];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                sources.push(std::fs::read_to_string(path).unwrap());
+            }
+        }
+    }
+    let types = std::fs::read_to_string(golden().join(format!("v{VERSION}/types.txt"))).unwrap();
+    let mut kept: Vec<(String, Vec<String>)> = Vec::new();
+    for line in types.lines() {
+        if let Some((name, kind)) = line.split_once(": ").filter(|_| !line.starts_with(' ')) {
+            if kind.starts_with("Enum") || kind.starts_with("Struct") {
+                kept.push((name.to_owned(), Vec::new()));
+            }
+        } else if let Some(name) =
+            line.strip_prefix("            name: \"").and_then(|rest| rest.strip_suffix("\","))
+        {
+            kept.last_mut().unwrap().1.push(name.to_owned());
+        }
+    }
+    assert!(kept.len() > 50, "{} types", kept.len());
+    for (name, names) in kept {
+        let found = names_in_source(&sources, &name);
+        assert!(
+            found.contains(&names),
+            "{name}: was {names:?}, is {found:?}; that needs a new version of images"
+        );
+    }
+}
+
 #[test]
 fn every_kept_image_means_what_it_meant() {
     for version in OLDEST_VERSION..=VERSION {

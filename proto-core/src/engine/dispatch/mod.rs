@@ -226,7 +226,7 @@ impl EngineView<'_> {
                 port.heard(bytes, now);
                 is_first = false;
             }
-            let accepted = port.frames(&mut rest, &self.bindings.inputs, store, command, self.tap);
+            let accepted = port.frames(&mut rest, self.bindings.inputs, store, command, self.tap);
             if let Some(deadline) = port.deadline_of_heard(&mut self.clock.dirty) {
                 self.arm(deadline);
             }
@@ -250,7 +250,7 @@ impl EngineView<'_> {
         }
         let (store, command) = (&mut *self.store, self.links.command.first_mut());
         let Some(port) = find_port(self.ports, id) else { return };
-        let accepted = port.device_frames(&mut &[][..], &self.bindings.inputs, store, command, self.tap);
+        let accepted = port.device_frames(&mut &[][..], self.bindings.inputs, store, command, self.tap);
         port.note_partial();
         self.after_field(id, &accepted, now);
     }
@@ -264,7 +264,7 @@ impl EngineView<'_> {
         if self.clock.has_slept {
             return port.discard(frame.data(), Some(frame.id()), self.tap, now);
         }
-        let accepted = port.can(frame, &self.bindings.inputs, store, command, self.tap);
+        let accepted = port.can(frame, self.bindings.inputs, store, command, self.tap);
         if accepted.frames == 0 {
             // Most are for other nodes of the bus.
             return;
@@ -291,7 +291,7 @@ impl EngineView<'_> {
     pub(crate) fn port_down(&mut self, id: PortId, now: Instant) {
         let Some(port) = find_port(self.ports, id) else { return };
         self.clock.dirty.add(Dirty::ALL);
-        port.down(&self.bindings.inputs, self.links.command.first_mut(), self.tap, now);
+        port.down(self.bindings.inputs, self.links.command.first_mut(), self.tap, now);
         self.exchanges_end(id);
         self.drop_forgotten(now);
         self.tell_alive(now);
@@ -301,7 +301,7 @@ impl EngineView<'_> {
         let Some(port) = find_port(self.ports, id) else { return };
         self.clock.dirty.add(Dirty::ALL);
         let was_off = port.bus == BusState::BusOff;
-        port.bus_state(state, &self.bindings.inputs, self.links.command.first_mut(), now);
+        port.bus_state(state, self.bindings.inputs, self.links.command.first_mut(), now);
         let deadline = port.deadline();
         self.arm(deadline);
         match (was_off, state == BusState::BusOff) {
@@ -387,7 +387,7 @@ impl EngineView<'_> {
             if !wanted.and(&accepted.set).is_empty() {
                 link.offered.or_at(now);
                 let state = || state.first().map(|state| state.group);
-                waits = waits || link.supervisor.is_up() && !link.is_ready(&self.store, state);
+                waits = waits || link.supervisor.is_up() && !link.is_ready(self.store, state);
             }
         }
         if let Some(link) = self.links.modbus.first_mut() {

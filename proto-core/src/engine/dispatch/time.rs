@@ -198,7 +198,7 @@ impl EngineView<'_> {
                 bump(&mut port.counters.timeouts);
                 add(&mut port.counters.values_expired, dropped);
             }
-            silence_commands(frame.bindings.of(&self.bindings.inputs), self.links.command.first_mut(), now);
+            silence_commands(frame.bindings.of(self.bindings.inputs), self.links.command.first_mut(), now);
         }
         if timed_out {
             self.drop_forgotten(now);
