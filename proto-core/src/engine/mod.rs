@@ -184,9 +184,8 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         done
     }
 
-    /// Out of line: a run loop would hold the stack of an empty store for ever.
+    /// Forgets the configuration. A tap that listens continues.
     fn clear(&mut self) {
-        // A tap that listens continues.
         self.store = Store::new(Vec::new());
         self.view().clear();
     }

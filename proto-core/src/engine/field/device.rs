@@ -130,6 +130,7 @@ pub(crate) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> 
 
 impl DeviceCodec {
     /// The frames of a recipe, whose bindings will begin at these places.
+    #[inline(never)]
     pub(crate) fn new(
         config: ConfigView<'_>,
         index: u8,

@@ -166,57 +166,21 @@ impl FieldPort {
             }
             let expected = pending.expected();
             let (flight, times) = (pending.flight, pending.asked().map(|item| item.times));
-            // Of a Modbus frame.
-            let (data, code) = match is_tcp {
+            let answer = match is_tcp {
                 true => modbus_tcp::content(frame),
                 false => (frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]), frame.get(2).copied()),
             };
+            let answer = match expected {
+                Some(_) => {
+                    Answer { data: answer.0, code: answer.1.unwrap_or(0).into(), is_modbus: true, is_tcp }
+                }
+                None => Answer { data: frame, code: 0, is_modbus: false, is_tcp },
+            };
             let before = accepted.frames;
-            // The exchange whose reply was taken, and its data.
-            let mut told = None;
-            let (verdict, sign) = match what {
-                Some(Heard::Reply(reply)) => {
-                    let verdict = match reply {
-                        Some(reply) => {
-                            let data = if expected.is_some() { data } else { frame };
-                            told = flight.map(|flight| (flight.exchange, data));
-                            let slot = usize::from(reply.slot);
-                            let verdict = frames.take_device(&reply.format, texts, data, slot, &mut accepted);
-                            // A transaction id tells to which of the requests it is the reply.
-                            if let Some(since) =
-                                flight.filter(|_| !is_tcp).and_then(|flight| flight.unanswered())
-                            {
-                                frames.store.was_asked(slot, since);
-                            }
-                            verdict
-                        }
-                        // A write was carried out.
-                        None => Ok(()),
-                    };
-                    (verdict, Sign::Answer(Ended::Good, 0))
-                }
-                Some(Heard::ReplyOrEcho) => (Ok(()), Sign::ReplyOrEcho),
-                Some(Heard::Pending(pending)) => {
-                    (take_other(&mut frames, Some(pending), texts, frame, &mut accepted), Sign::Pending)
-                }
-                Some(Heard::Refusal(refusal)) => {
-                    let code = expected.and(code).unwrap_or(0);
-                    (
-                        take_other(&mut frames, refusal, texts, frame, &mut accepted)
-                            .and(Err(Rejection::Refused)),
-                        Sign::Answer(refused_with(code, expected.is_some()), code.into()),
-                    )
-                }
-                Some(Heard::Late { exchange, is_pending }) => {
-                    (Err(Rejection::Late), Sign::Late { exchange, is_pending })
-                }
-                Some(Heard::Ambiguous) => (Err(Rejection::Late), Sign::Ambiguous),
-                Some(Heard::Unasked(format, slot, nth)) => {
-                    told = nth.map(|nth| (nth, frame));
-                    (frames.take_device(format, texts, frame, slot, &mut accepted), Sign::Unasked(nth))
-                }
-                None if is_tcp => (frames.rejected(Rejection::OtherDevice), Sign::Nothing),
-                Some(Heard::Echo) | None => (Err(Rejection::NoFrame), Sign::Nothing),
+            let Taken { verdict, sign, told } = match what {
+                Some(what) => take_heard(&mut frames, texts, what, (flight, frame, answer), &mut accepted),
+                None if is_tcp => Taken::nothing(frames.rejected(Rejection::OtherDevice)),
+                None => Taken::nothing(Err(Rejection::NoFrame)),
             };
             if let Some(told) = told.filter(|_| verdict.is_ok()) {
                 look_for_restart(line, items, &mut table, bindings, told, now);
@@ -314,28 +278,9 @@ impl FieldPort {
             },
         };
         let times = pending.asked().map(|item| item.times);
-        let mut told = None;
-        let (verdict, sign) = match pending.classify(answer, is, |_| false) {
-            Some(Heard::Reply(Some(reply))) => {
-                told = flight.map(|flight| (flight.exchange, frame.data()));
-                let slot = usize::from(reply.slot);
-                let verdict = frames.take_device(&reply.format, texts, frame.data(), slot, accepted);
-                if let Some(since) = flight.and_then(|flight| flight.unanswered()) {
-                    frames.store.was_asked(slot, since);
-                }
-                (verdict, Sign::Answer(Ended::Good, 0))
-            }
-            Some(Heard::Pending(pending)) => {
-                (take_other(&mut frames, Some(pending), texts, frame.data(), accepted), Sign::Pending)
-            }
-            Some(Heard::Refusal(refusal)) => (
-                take_other(&mut frames, refusal, texts, frame.data(), accepted).and(Err(Rejection::Refused)),
-                Sign::Answer(Ended::Refused, code),
-            ),
-            Some(Heard::Late { exchange, is_pending }) => {
-                (Err(Rejection::Late), Sign::Late { exchange, is_pending })
-            }
-            Some(_) => (Err(Rejection::Late), Sign::Ambiguous),
+        let of_reply = Answer { data: frame.data(), code, is_modbus: false, is_tcp: false };
+        let Taken { verdict, sign, told } = match pending.classify(answer, is, |_| false) {
+            Some(heard) => take_heard(&mut frames, texts, heard, (flight, frame.data(), of_reply), accepted),
             None => {
                 let answers = pending.answers().map(|format| (None, format));
                 let unasked = pending.unasked();
@@ -556,8 +501,74 @@ enum Sign {
     Unasked(Option<u8>),
 }
 
+/// The answer in a frame.
+#[derive(Clone, Copy)]
+struct Answer<'f> {
+    /// The data of a Modbus frame, or the frame.
+    data: &'f [u8],
+    /// Of a refusal.
+    code: u16,
+    is_modbus: bool,
+    /// Its transaction id tells to which of the requests it is the reply.
+    is_tcp: bool,
+}
+
+/// What became of a frame.
+struct Taken<'f> {
+    verdict: Result<(), Rejection>,
+    sign: Sign,
+    /// The exchange whose reply was taken, and its data.
+    told: Option<(u8, &'f [u8])>,
+}
+
+impl Taken<'_> {
+    /// It says nothing of the exchanges.
+    const fn nothing(verdict: Result<(), Rejection>) -> Self {
+        Self { verdict, sign: Sign::Nothing, told: None }
+    }
+}
+
+/// Takes the values of a frame that was told apart.
+fn take_heard<'f>(
+    frames: &mut FrameContext<'_>,
+    texts: &[TextBind],
+    heard: Heard<'_>,
+    (flight, frame, answer): (Option<Flight>, &'f [u8], Answer<'f>),
+    accepted: &mut Accepted,
+) -> Taken<'f> {
+    let mut told = None;
+    let (verdict, sign) = match heard {
+        Heard::Reply(Some(reply)) => {
+            told = flight.map(|flight| (flight.exchange, answer.data));
+            let slot = usize::from(reply.slot);
+            let verdict = frames.take_device(&reply.format, texts, answer.data, slot, accepted);
+            let since = flight.filter(|_| !answer.is_tcp).and_then(|flight| flight.unanswered());
+            if let Some(since) = since {
+                frames.store.was_asked(slot, since);
+            }
+            (verdict, Sign::Answer(Ended::Good, 0))
+        }
+        // A write was executed.
+        Heard::Reply(None) => (Ok(()), Sign::Answer(Ended::Good, 0)),
+        Heard::ReplyOrEcho => (Ok(()), Sign::ReplyOrEcho),
+        Heard::Pending(pending) => (take_other(frames, Some(pending), texts, frame, accepted), Sign::Pending),
+        Heard::Refusal(refusal) => (
+            take_other(frames, refusal, texts, frame, accepted).and(Err(Rejection::Refused)),
+            Sign::Answer(refused_with(answer.code, answer.is_modbus), answer.code),
+        ),
+        Heard::Late { exchange, is_pending } => (Err(Rejection::Late), Sign::Late { exchange, is_pending }),
+        Heard::Ambiguous => (Err(Rejection::Late), Sign::Ambiguous),
+        Heard::Unasked(format, slot, nth) => {
+            told = nth.map(|nth| (nth, frame));
+            (frames.take_device(format, texts, frame, slot, accepted), Sign::Unasked(nth))
+        }
+        Heard::Echo => (Err(Rejection::NoFrame), Sign::Nothing),
+    };
+    Taken { verdict, sign, told }
+}
+
 /// What a refusal means; on Modbus its code tells (docs/wire/modbus-rtu.md section 4).
-const fn refused_with(code: u8, is_modbus: bool) -> Ended {
+const fn refused_with(code: u16, is_modbus: bool) -> Ended {
     match code {
         5 if is_modbus => Ended::Accepted,
         6 if is_modbus => Ended::Busy,

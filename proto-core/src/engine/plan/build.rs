@@ -53,6 +53,8 @@ impl Groups {
 }
 
 impl EngineView<'_> {
+    // Out of line, as the parts that make large values: a run loop would hold their stacks for ever, and these would add up.
+    #[inline(never)]
     pub(crate) fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         config.validate().map_err(BuildError::Config)?;
         // One copy of the plan, where `map_err` would make two.
@@ -143,6 +145,7 @@ impl EngineView<'_> {
         Ok(())
     }
 
+    #[inline(never)]
     fn add_port(
         &mut self,
         config: ConfigView<'_>,
@@ -157,8 +160,52 @@ impl EngineView<'_> {
         };
         let first_frame = self.store.frames.len() as u8;
         if port.safe_at_start {
-            self.store.is_overduefrom_start();
+            self.store.overdue_from_start();
         }
+        let next_rule = self.add_input_frames(config, port, recipe)?;
+        let inputs = self.add_inputs(config, recipe, next_rule, dialect)?;
+        self.add_rules(config, port, recipe)?;
+        let outputs = self.add_outputs(config, recipe)?;
+        self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
+        let has_output = recipe.part_frames(Direction::Output).next().is_some();
+        let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
+        sender.refresh = port.refresh.unwrap_or(Duration::MAX);
+        if let Bus::ModbusTcp { host, port: tcp_port } = &port.bus {
+            let link = DeviceLink::new(PortId(index), port.name.clone(), host.clone(), *tcp_port);
+            let done = self.links.devices.push(link);
+            done.map_err(|_| one_too_many(Counted::RecipeLinks, self.links.devices.capacity()))?;
+        }
+        let own = FieldPort {
+            id: PortId(index),
+            name: port.name.clone(),
+            recipe: port.recipe,
+            // Those of the recipe follow.
+            codec: Codec::Can { input: None, output: None },
+            mode: recipe.mode,
+            line,
+            is_partial: false,
+            sender,
+            inputs,
+            outputs,
+            first_frame,
+            is_up: false,
+            bus: BusState::Active,
+            reply: ReplyCode::None,
+            counters: PortCounters::default(),
+            last_rejection: None,
+        };
+        let full = one_too_many(Counted::FieldPorts, self.ports.capacity());
+        self.ports.push(own).map_err(|_| full)?;
+        self.store.edges.push(EdgeQueue::default()).map_err(|_| full)
+    }
+
+    /// Adds the input frames of a port to the store; returns where what stands behind its bindings begins.
+    fn add_input_frames(
+        &mut self,
+        config: ConfigView<'_>,
+        port: &Port,
+        recipe: &Recipe,
+    ) -> Result<u16, BuildError> {
         let mut next_binding = self.bindings.inputs.len() as u16;
         let mut frames = config.frames_of(recipe, Direction::Input);
         while let Some((_, fields)) = frames.next() {
@@ -198,9 +245,19 @@ impl EngineView<'_> {
                 .map_err(|_| one_too_many(Counted::InputFrames, MAX_INPUT_FRAMES))?;
             whole.iter().for_each(|var| self.store.image.assign(var, group));
         }
+        Ok(next_binding)
+    }
+
+    /// Adds the bindings of a port's input fields; what stands behind them begins at `next_rule`.
+    fn add_inputs(
+        &mut self,
+        config: ConfigView<'_>,
+        recipe: &Recipe,
+        mut next_rule: u16,
+        dialect: Dialect,
+    ) -> Result<Span, BuildError> {
         let fields = self.bindings.inputs.capacity();
         let full = || one_too_many(Counted::UserFields, fields);
-        let mut next_rule = next_binding;
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
         for (frame, nth, field) in config.fields_of(recipe, Direction::Input) {
             let Some(element) = field.element() else {
@@ -253,7 +310,13 @@ impl EngineView<'_> {
             self.bindings.inputs.push(InputBind::new(to, element)).map_err(|_| full())?;
             inputs.len = inputs.len.saturating_add(1);
         }
-        self.add_rules(config, port, recipe)?;
+        Ok(inputs)
+    }
+
+    /// Adds the bindings of a port's output fields, and what these may send.
+    fn add_outputs(&mut self, config: ConfigView<'_>, recipe: &Recipe) -> Result<Span, BuildError> {
+        let fields = self.bindings.outputs.capacity();
+        let full = || one_too_many(Counted::UserFields, fields);
         let mut outputs = Span { start: self.bindings.outputs.len() as u16, len: 0 };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
             if let Some(sendable) = Sendable::new(field) {
@@ -270,37 +333,7 @@ impl EngineView<'_> {
             self.bindings.outputs.push(OutputBind::new(ty, from, element)).map_err(|_| full())?;
             outputs.len = outputs.len.saturating_add(1);
         }
-        self.store.watches_bits |= matches!(recipe.send, SendOn::Rising { .. });
-        let has_output = recipe.part_frames(Direction::Output).next().is_some();
-        let mut sender = Sender::new(recipe.send, recipe.on_stale, port.stale_after, port.cycle, has_output);
-        sender.refresh = port.refresh.unwrap_or(Duration::MAX);
-        if let Bus::ModbusTcp { host, port: tcp_port } = &port.bus {
-            let link = DeviceLink::new(PortId(index), port.name.clone(), host.clone(), *tcp_port);
-            let done = self.links.devices.push(link);
-            done.map_err(|_| one_too_many(Counted::RecipeLinks, self.links.devices.capacity()))?;
-        }
-        let own = FieldPort {
-            id: PortId(index),
-            name: port.name.clone(),
-            recipe: port.recipe,
-            // Those of the recipe follow.
-            codec: Codec::Can { input: None, output: None },
-            mode: recipe.mode,
-            line,
-            is_partial: false,
-            sender,
-            inputs,
-            outputs,
-            first_frame,
-            is_up: false,
-            bus: BusState::Active,
-            reply: ReplyCode::None,
-            counters: PortCounters::default(),
-            last_rejection: None,
-        };
-        let full = one_too_many(Counted::FieldPorts, self.ports.capacity());
-        self.ports.push(own).map_err(|_| full)?;
-        self.store.edges.push(EdgeQueue::default()).map_err(|_| full)
+        Ok(outputs)
     }
 
     /// What stands behind the input fields of a port follows its bindings, in the order of the fields.
@@ -338,6 +371,7 @@ impl EngineView<'_> {
 
     /// Lays out the frames of the port that was added last. In its place: a codec is large, and each
     /// time that it is passed on it is copied.
+    #[inline(never)]
     fn add_codec(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
         let Some(own) = self.ports.last_mut() else { return Ok(()) };
         // Validation has refused recipes that the bus cannot carry.
@@ -374,6 +408,7 @@ impl EngineView<'_> {
         Ok(())
     }
 
+    #[inline(never)]
     fn add_command_link(&mut self, config: ConfigView<'_>, dialect: Dialect) -> Result<(), BuildError> {
         let link = CommandLink::new(config.controller.command_port, dialect, config.commands);
         let link = link.ok_or(one_too_many(Counted::CommandBytes, MAX_COMMAND_BYTES))?;
@@ -381,6 +416,7 @@ impl EngineView<'_> {
         Ok(())
     }
 
+    #[inline(never)]
     fn add_uplink(
         &mut self,
         config: ConfigView<'_>,
@@ -470,6 +506,7 @@ impl EngineView<'_> {
         }
     }
 
+    #[inline(never)]
     fn assign_sources(
         &mut self,
         config: ConfigView<'_>,

@@ -9,6 +9,7 @@ use crate::recipe::{CanLayout, Deframer, StreamLayout};
 use crate::sysvar::Direction;
 
 /// The layouts of a stream recipe, in the place of the port's.
+#[inline(never)]
 pub(crate) fn stream_codec(
     config: ConfigView<'_>,
     index: u8,
@@ -47,6 +48,7 @@ pub(crate) fn stream_layout(
 }
 
 /// The layouts of a CAN recipe, in the place of the port's.
+#[inline(never)]
 pub(crate) fn can_codec(
     config: ConfigView<'_>,
     index: u8,

@@ -40,49 +40,65 @@ struct Formats<'c> {
     refusals: &'c mut VecView<InputBind>,
 }
 
-// A frame under construction takes some kilobytes of stack: one at a time, each in a function of its own.
+/// Where a frame's fields are.
+#[derive(Clone, Copy)]
+enum FrameOf<'c> {
+    /// The data of Modbus registers or coils.
+    Data(&'c [FieldSpec]),
+    Spec(&'c FrameSpec),
+}
+
+impl FrameOf<'_> {
+    fn layout(self, config: ConfigView<'_>, part: Direction) -> Result<DeviceFrame, LayoutError> {
+        match self {
+            Self::Data(fields) => DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields),
+            Self::Spec(spec) => spec.layout(config, part),
+        }
+    }
+
+    fn id(self) -> CanId {
+        match self {
+            Self::Spec(FrameSpec { id: Some(id), .. }) => *id,
+            _ => CanId::Standard(0),
+        }
+    }
+}
+
 impl Formats<'_> {
-    fn format(
-        &mut self,
-        part: Direction,
-        frame: Result<DeviceFrame, LayoutError>,
-        id: Option<CanId>,
-    ) -> Result<DeviceFormat, BuildError> {
+    fn format(&mut self, part: Direction, of: FrameOf<'_>) -> Result<DeviceFormat, BuildError> {
         let (next, nth) = match (part, &mut self.frames) {
             (Direction::Input, [nth, _]) => (&mut self.places.inputs, nth),
             (Direction::Output, [_, nth]) => (&mut self.places.outputs, nth),
         };
+        let frame = of.layout(self.config, part);
         let frame =
             frame.map_err(|error| BuildError::Layout { recipe: self.recipe, part, frame: *nth, error })?;
         let bindings = Span { start: *next, len: frame.elements.len() as u16 };
         *next = next.saturating_add(bindings.len);
         *nth = nth.saturating_add(1);
-        Ok(DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings })
+        Ok(DeviceFormat { layout: frame.layout, id: of.id(), bindings })
     }
 
-    fn input(
-        &mut self,
-        frame: Result<DeviceFrame, LayoutError>,
-        id: Option<CanId>,
-    ) -> Result<InputFormat, BuildError> {
-        let format = self.format(Direction::Input, frame, id)?;
+    fn input(&mut self, of: FrameOf<'_>) -> Result<InputFormat, BuildError> {
+        let format = self.format(Direction::Input, of)?;
         let slot = self.places.slot;
         self.places.slot = slot.saturating_add(1);
         Ok(InputFormat { format, slot })
     }
 
-    /// A pending answer or a refusal. The fields of one without values are behind those of the recipe.
-    fn other(
-        &mut self,
-        frame: Result<DeviceFrame, LayoutError>,
-        id: Option<CanId>,
-        has_values: bool,
-    ) -> Result<OtherFormat, BuildError> {
-        if has_values {
-            let InputFormat { format, slot } = self.input(frame, id)?;
+    /// A pending answer or a refusal.
+    fn other(&mut self, spec: &FrameSpec) -> Result<OtherFormat, BuildError> {
+        if has_values(spec.fields.of(self.config.fields)) {
+            let InputFormat { format, slot } = self.input(FrameOf::Spec(spec))?;
             return Ok(OtherFormat { format, slot: Some(slot) });
         }
+        Ok(OtherFormat { format: self.without_values(spec)?, slot: None })
+    }
+
+    /// One without values, whose fields are behind those of the recipe.
+    fn without_values(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
         let (recipe, part, [frames, _]) = (self.recipe, Direction::Input, self.frames);
+        let frame = spec.layout(self.config, part);
         let frame = frame.map_err(|error| BuildError::Layout { recipe, part, frame: frames, error })?;
         let len = frame.elements.len() as u16;
         let bindings = Span { start: self.refusals.len() as u16, len };
@@ -92,8 +108,7 @@ impl Formats<'_> {
                 .push(bind)
                 .map_err(|_| one_too_many(Counted::UserFields, self.refusals.capacity()))?;
         }
-        let format = DeviceFormat { layout: frame.layout, id: id.unwrap_or(CanId::Standard(0)), bindings };
-        Ok(OtherFormat { format, slot: None })
+        Ok(DeviceFormat { layout: frame.layout, id: FrameOf::Spec(spec).id(), bindings })
     }
 
     /// The data of Modbus registers or coils that are sent.
@@ -102,8 +117,7 @@ impl Formats<'_> {
         if fields.is_empty() {
             return Ok(None);
         }
-        let part = Direction::Output;
-        self.format(part, DeviceFrame::new(Carrier::Whole, part, (&[], &[]), fields), None).map(Some)
+        self.format(Direction::Output, FrameOf::Data(fields)).map(Some)
     }
 
     /// The same for those that are received.
@@ -112,21 +126,7 @@ impl Formats<'_> {
         if fields.is_empty() {
             return Ok(None);
         }
-        let frame = DeviceFrame::new(Carrier::Whole, Direction::Input, (&[], &[]), fields);
-        self.input(frame, None).map(Some)
-    }
-
-    fn request_of(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
-        self.format(Direction::Output, spec.layout(self.config, Direction::Output), spec.id)
-    }
-
-    fn reply_of(&mut self, spec: &FrameSpec) -> Result<InputFormat, BuildError> {
-        self.input(spec.layout(self.config, Direction::Input), spec.id)
-    }
-
-    fn other_of(&mut self, spec: &FrameSpec) -> Result<OtherFormat, BuildError> {
-        let has_values = has_values(spec.fields.of(self.config.fields));
-        self.other(spec.layout(self.config, Direction::Input), spec.id, has_values)
+        self.input(FrameOf::Data(fields)).map(Some)
     }
 
     /// Bytes of a reply to a remote request.
@@ -191,15 +191,15 @@ impl Formats<'_> {
                         _ => Asks::Frame,
                     };
                     if matches!(item.asks, Asks::Frame) {
-                        item.request = Some(self.request_of(request)?);
+                        item.request = Some(self.format(Direction::Output, FrameOf::Spec(request))?);
                     }
                 }
                 if let Some(reply) = frame(reply) {
-                    item.reply = Some(self.reply_of(reply)?);
+                    item.reply = Some(self.input(FrameOf::Spec(reply))?);
                 }
                 for (from, to) in [(exchange.pending, &mut item.pending), (refusal, &mut item.refusal)] {
                     if let Some(spec) = frame(from) {
-                        *to = Some(self.other_of(spec)?);
+                        *to = Some(self.other(spec)?);
                     }
                 }
                 item.times.is_answered = item.reply.is_some();
@@ -214,6 +214,7 @@ impl Formats<'_> {
 impl EngineView<'_> {
     /// Adds the exchanges of a port, whose fields and input frames behind those of its parts are at
     /// these places.
+    #[inline(never)]
     pub(crate) fn add_exchanges(
         &mut self,
         config: ConfigView<'_>,

@@ -369,7 +369,7 @@ impl Store {
     }
 
     /// At the first tick, the frames that are overdue from the start are handled.
-    pub(crate) fn is_overduefrom_start(&mut self) {
+    pub(crate) fn overdue_from_start(&mut self) {
         self.next_overdue = Stamp::at(Instant::ZERO);
     }
 
