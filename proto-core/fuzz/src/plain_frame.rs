@@ -239,7 +239,8 @@ fn algorithm_len(algorithm: &Algorithm) -> usize {
     match algorithm {
         Algorithm::Crc(crc) => usize::from(crc.width).div_ceil(8),
         Algorithm::Sum16 => 2,
-        _ => 1,
+        Algorithm::Sum8 | Algorithm::Xor8 | Algorithm::Lrc => 1,
+        _ => panic!("a checksum without a reference"),
     }
 }
 
