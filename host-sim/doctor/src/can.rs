@@ -31,7 +31,7 @@ pub(crate) fn examine(seen: &PortCase<'_>, state: BusState, findings: &mut Vec<F
     if counters.rejected_length > 0 {
         findings.extend(length(seen, &recipe_ids));
     } else if counters.rejected_remote > 0 {
-        findings.push(seen.fault(
+        findings.push(seen.place.fault(
             Cause::Remote,
             format!("{} remote frames", counters.rejected_remote),
             "frames with data",
@@ -39,7 +39,7 @@ pub(crate) fn examine(seen: &PortCase<'_>, state: BusState, findings: &mut Vec<F
             "Let the device send by itself",
         ));
     } else if let Some((one, meant)) = other_kind(&foreign, &recipe_ids) {
-        findings.push(seen.fault(
+        findings.push(seen.place.fault(
             Cause::IdKind,
             format!("id {} seen {} times", one.id, one.count()),
             format!("id {meant}"),
@@ -55,7 +55,7 @@ pub(crate) fn examine(seen: &PortCase<'_>, state: BusState, findings: &mut Vec<F
 
 fn bus(seen: &PortCase<'_>, cause: Cause, what: &str) -> Finding {
     let bitrate = bitrate(seen);
-    seen.fault(
+    seen.place.fault(
         cause,
         what,
         "error-active",
@@ -83,7 +83,7 @@ fn ids(seen: &PortCase<'_>, mut foreign: Vec<&SeenId>, recipe_ids: &[CanId]) -> 
     foreign.sort_by_key(|one| std::cmp::Reverse(one.count()));
     let shown: Vec<_> =
         foreign.iter().take(4).map(|one| format!("id {} seen {} times", one.id, one.count())).collect();
-    seen.fault(
+    seen.place.fault(
         Cause::ForeignIds,
         shown.join(", "),
         format!("id {}", words(recipe_ids)),
@@ -115,7 +115,7 @@ fn length(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Option<Finding> {
         _ => None,
     });
     let expected = sizes.sum::<Option<usize>>();
-    Some(seen.fault(
+    Some(seen.place.fault(
         Cause::CanLength,
         format!("id {} with {} bytes", one.id, one.len),
         expected.map_or("the length of the recipe".into(), |len| format!("{len} bytes")),
@@ -128,7 +128,7 @@ fn nothing(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Finding {
     let severity = if seen.status.age.is_some() { Severity::Fault } else { Severity::Warning };
     let seconds = seen.status.age.unwrap_or(seen.case.running).as_millis() / 1000;
     if seen.record.fd_frames > 0 {
-        return seen.fault(
+        return seen.place.fault(
             Cause::CanLength,
             format!("{} CAN FD frames", seen.record.fd_frames),
             "classic CAN frames",
@@ -136,7 +136,7 @@ fn nothing(seen: &PortCase<'_>, recipe_ids: &[CanId]) -> Finding {
             "Set the device to classic CAN",
         );
     }
-    seen.found(
+    seen.place.found(
         severity,
         Cause::NoBytes,
         format!("0 frames in {seconds} s"),

@@ -7,7 +7,7 @@ use proto_core::wire::state::{OperationMode, ProgramState, RobotState, SafetySta
 
 use crate::Case;
 use crate::command::{REPORTED_FOR, ago, is_command};
-use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
+use crate::finding::{Cause, Finding, FindingPlace, Severity};
 use crate::record::PortRecord;
 use crate::state::ObservedPort;
 
@@ -26,7 +26,7 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     {
         let place = FindingPlace::Controller;
         let expected = "remote or automatic mode, powered and enabled: the file has commands";
-        findings.push(finding((Severity::Warning, &place, cause), seen, expected, likely, remedy));
+        findings.push(place.found(Severity::Warning, cause, seen, expected, likely, remedy));
     }
 }
 
@@ -50,8 +50,8 @@ fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
             let others = case.status.links.iter().filter_map(|link| link.other_text.as_ref());
             let mut others = others.filter(|other| other.age < REPORTED_FOR);
             let other = others.find(|other| other.command == port.command && other.command.is_some())?;
-            Some(finding(
-                (Severity::Fault, &place, Cause::OtherReply),
+            Some(place.fault(
+                Cause::OtherReply,
                 format!("{given} answered{}: {:?}", ago(other.age), other.text),
                 "success, fail or already, and the command's name",
                 "A controller version with other words: nobody knows whether it was done",
@@ -66,8 +66,8 @@ fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
                 return None;
             }
             let when = age.map_or_else(String::new, |age| format!(", given{}", ago(age)));
-            Some(finding(
-                (Severity::Fault, &place, Cause::NoReply),
+            Some(place.fault(
+                Cause::NoReply,
                 format!("no reply to {given}{when}"),
                 "a reply from the command port",
                 "The connection was lost, or the controller is busy or hangs",
@@ -80,8 +80,8 @@ fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
                 Some(last) => (last.text.as_str(), ago(last.age)),
                 None => ("the link or its room was lacking", String::new()),
             };
-            Some(finding(
-                (Severity::Fault, &place, Cause::NotSent),
+            Some(place.fault(
+                Cause::NotSent,
                 format!("{given} was not sent{age}: {why}"),
                 "",
                 "A command is sent at once or not at all",
@@ -99,7 +99,7 @@ fn failed(case: &Case<'_>, port: &ObservedPort, place: &FindingPlace) -> Option<
     let then = last.controller.or(case.looked);
     let refused = |why: &str| format!("{command} refused{age}: {why}");
     let found = |severity, cause, seen: String, likely: &str, remedy: &str| {
-        Some(finding((severity, place, cause), seen, "", likely, remedy))
+        Some(place.found(severity, cause, seen, "", likely, remedy))
     };
     let fault = |cause, seen, likely: &str, remedy: &str| found(Severity::Fault, cause, seen, likely, remedy);
     let Some(states) = then else {

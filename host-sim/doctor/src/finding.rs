@@ -230,20 +230,46 @@ impl Serialize for Finding {
     }
 }
 
-pub(crate) fn finding(
-    (severity, place, cause): (Severity, &FindingPlace, Cause),
-    seen: impl Into<String>,
-    expected: impl Into<String>,
-    likely: impl Into<String>,
-    remedy: impl Into<String>,
-) -> Finding {
-    Finding {
-        severity,
-        place: place.clone(),
-        cause,
-        seen: seen.into(),
-        expected: expected.into(),
-        likely: likely.into(),
-        remedy: remedy.into(),
+impl FindingPlace {
+    pub(crate) fn found(
+        &self,
+        severity: Severity,
+        cause: Cause,
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        Finding {
+            severity,
+            place: self.clone(),
+            cause,
+            seen: seen.into(),
+            expected: expected.into(),
+            likely: likely.into(),
+            remedy: remedy.into(),
+        }
+    }
+
+    pub(crate) fn fault(
+        &self,
+        cause: Cause,
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        self.found(Severity::Fault, cause, seen, expected, likely, remedy)
+    }
+
+    pub(crate) fn warning(
+        &self,
+        cause: Cause,
+        seen: impl Into<String>,
+        expected: impl Into<String>,
+        likely: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        self.found(Severity::Warning, cause, seen, expected, likely, remedy)
     }
 }

@@ -33,7 +33,7 @@ fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
     }
     let (value, age) = (format!("value {value}"), ago(age));
     match why? {
-        DropReason::Based => Some(seen.warning(
+        DropReason::Based => Some(seen.place.warning(
             Cause::FirstValue,
             format!(
                 "{value} gave no command{age}: it was the first after the start, silence, sleep or a lost device"
@@ -43,7 +43,7 @@ fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
             "Release it and press again. If the device sends only changes, write base = \"keep\" beside commands, \
              a longer timeout_ms, and level for a stop button",
         )),
-        DropReason::Unknown => Some(seen.warning(
+        DropReason::Unknown => Some(seen.place.warning(
             Cause::UnknownValue,
             format!("{value} gave no command{age}: it is in no entry of the table"),
             "a value of the table `commands`, or the idle one",
@@ -68,7 +68,7 @@ fn slept(seen: &PortCase<'_>) -> Option<Finding> {
         0 => "Input".to_owned(),
         _ => count(counted, "chunk") + " of input",
     };
-    Some(seen.warning(
+    Some(seen.place.warning(
         Cause::Slept,
         format!(
             "{chunks} discarded{age}: the gateway itself had slept, and what waited is of an unknown age"

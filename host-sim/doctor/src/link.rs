@@ -4,7 +4,7 @@ use proto_core::config::Parts;
 use proto_core::engine::{LinkKind, Transport};
 
 use crate::Case;
-use crate::finding::{Cause, Finding, FindingPlace, Severity, finding};
+use crate::finding::{Cause, Finding, FindingPlace, Severity};
 use crate::record::{LinkFacts, Reach};
 use crate::state;
 
@@ -30,29 +30,6 @@ struct LinkCase<'a> {
 }
 
 impl LinkCase<'_> {
-    fn found(
-        &self,
-        severity: Severity,
-        cause: Cause,
-        seen: impl Into<String>,
-        expected: impl Into<String>,
-        likely: impl Into<String>,
-        remedy: impl Into<String>,
-    ) -> Finding {
-        finding((severity, &self.place, cause), seen, expected, likely, remedy)
-    }
-
-    fn fault(
-        &self,
-        cause: Cause,
-        seen: impl Into<String>,
-        expected: impl Into<String>,
-        likely: impl Into<String>,
-        remedy: impl Into<String>,
-    ) -> Option<Finding> {
-        Some(self.found(Severity::Fault, cause, seen, expected, likely, remedy))
-    }
-
     fn to(&self) -> String {
         match self.info.transport {
             Transport::Tcp { port } => format!("{} port {port} (TCP)", self.info.host),
@@ -108,8 +85,8 @@ impl LinkCase<'_> {
             }
             _ => ("controller.address".to_owned(), format!("controller.ports.{key} of the file"), "pendant"),
         };
-        match reach {
-            Some(Reach::Refused) => self.fault(
+        Some(match reach {
+            Some(Reach::Refused) => self.place.fault(
                 Cause::Refused,
                 format!("{to} refuses the connection"),
                 expected,
@@ -117,7 +94,7 @@ impl LinkCase<'_> {
                  off",
                 format!("Check {port}, and that the service is on at the {where_on}"),
             ),
-            Some(Reach::NoSuchHost) => self.fault(
+            Some(Reach::NoSuchHost) => self.place.fault(
                 Cause::NoSuchHost,
                 format!("the name {host} is not known"),
                 expected,
@@ -127,17 +104,17 @@ impl LinkCase<'_> {
                     _ => "Write the controller's IP address",
                 },
             ),
-            Some(Reach::Failed(error)) => self.fault(
+            Some(Reach::Failed(error)) => self.place.fault(
                 Cause::Unreachable,
                 format!("{to}: {error}"),
                 expected,
                 "The network does not lead there",
                 format!("Try `ping {host}`; check cable, address and mask"),
             ),
-            _ => self.fault(Cause::Unreachable, format!("no answer from {to}"), expected, format!(
+            _ => self.place.fault(Cause::Unreachable, format!("no answer from {to}"), expected, format!(
                     "{address} is another machine's or nobody's, a cable is unplugged, or a firewall drops it"
                 ), format!("Try `ping {host}`; check cable, address and mask")),
-        }
+        })
     }
 
     fn connected(&self) -> Option<Finding> {
@@ -146,45 +123,50 @@ impl LinkCase<'_> {
         let (what, key) = self.service();
         let since = self.info.up_for.as_millis();
         let silences = self.info.history.silences;
-        match self.info.kind {
-            LinkKind::State if counters.malformed > 0 && counters.malformed >= counters.received => self
-                .fault(
+        Some(match self.info.kind {
+            LinkKind::State if counters.malformed > 0 && counters.malformed >= counters.received => {
+                self.place.fault(
                     Cause::Dialect,
                     format!("{to} sends {} bytes that are no state packets", counters.bytes_in),
                     "packets of 1468 bytes",
                     "Another port, or a controller version with another packet",
                     format!("Check controller.ports.{key} and controller.dialect"),
-                ),
-            LinkKind::State if counters.received == 0 && (silences > 0 || since >= 1_500) => self.fault(
-                Cause::LinkSilent,
-                format!("{to} is connected; {} bytes, 0 packets", counters.bytes_in),
-                "ten packets a second",
-                format!("This is not {what}, or the controller is still starting"),
-                format!("Check controller.ports.{key}"),
-            ),
-            LinkKind::Modbus if counters.refused > 0 && counters.refused >= counters.received => self.fault(
-                Cause::LinkRefuses,
-                format!("{to} refuses {} of {} requests", counters.refused, counters.sent),
-                "answers",
-                "The controller's Modbus map lacks these registers: another software version",
-                "Check controller.dialect, and the variables that `host-sim check` sends over Modbus",
-            ),
-            LinkKind::Modbus if counters.timeouts > 0 && counters.received == 0 => self.fault(
+                )
+            }
+            LinkKind::State if counters.received == 0 && (silences > 0 || since >= 1_500) => {
+                self.place.fault(
+                    Cause::LinkSilent,
+                    format!("{to} is connected; {} bytes, 0 packets", counters.bytes_in),
+                    "ten packets a second",
+                    format!("This is not {what}, or the controller is still starting"),
+                    format!("Check controller.ports.{key}"),
+                )
+            }
+            LinkKind::Modbus if counters.refused > 0 && counters.refused >= counters.received => {
+                self.place.fault(
+                    Cause::LinkRefuses,
+                    format!("{to} refuses {} of {} requests", counters.refused, counters.sent),
+                    "answers",
+                    "The controller's Modbus map lacks these registers: another software version",
+                    "Check controller.dialect, and the variables that `host-sim check` sends over Modbus",
+                )
+            }
+            LinkKind::Modbus if counters.timeouts > 0 && counters.received == 0 => self.place.fault(
                 Cause::LinkSilent,
                 format!("{to} answers none of {} requests", counters.sent),
                 "answers of a Modbus server",
                 format!("Something else than {what} listens there"),
                 format!("Check controller.ports.{key}"),
             ),
-            LinkKind::Command if counters.timeouts > 0 && counters.received == 0 => self.fault(
+            LinkKind::Command if counters.timeouts > 0 && counters.received == 0 => self.place.fault(
                 Cause::Dialect,
                 format!("{to} replies to none of {} commands", counters.sent),
                 "a reply to each",
                 format!("This is not {what}, or the controller wants another end of line"),
                 format!("Check controller.ports.{key} and controller.dialect"),
             ),
-            _ => None,
-        }
+            _ => return None,
+        })
     }
 
     /// Whether the recipe of the link to the controller's recipe server has an output part, so that the
@@ -203,16 +185,16 @@ impl LinkCase<'_> {
         );
         match reach {
             Some(Reach::Refused) => {
-                return self.fault(
+                return Some(self.place.fault(
                     Cause::Refused,
                     format!("{} sent, {} received; {to} refuses datagrams", counters.sent, counters.received),
                     format!("{what} of the controller"),
                     "The machine is there and nobody listens at this UDP port",
                     remedy,
-                );
+                ));
             }
             Some(Reach::Untried) => {
-                return Some(self.found(
+                return Some(self.place.found(
                     Severity::Note,
                     Cause::OneWay,
                     format!("{to} was not tried: over UDP that takes a frame"),
@@ -230,7 +212,7 @@ impl LinkCase<'_> {
         let severity = if self.expects_answers() { Severity::Fault } else { Severity::Note };
         let seen = format!("{} sent, 0 received at {to}", counters.sent);
         Some(match severity {
-            Severity::Fault => self.found(
+            Severity::Fault => self.place.found(
                 severity,
                 Cause::OneWay,
                 seen,
@@ -238,7 +220,7 @@ impl LinkCase<'_> {
                 "Another UDP port than the controller's, no recipe assigned to it, or a firewall",
                 remedy,
             ),
-            _ => self.found(
+            _ => self.place.found(
                 severity,
                 Cause::OneWay,
                 seen,
@@ -254,19 +236,19 @@ impl LinkCase<'_> {
             return None;
         }
         let seconds = self.case.running.as_millis() / 1000;
-        self.fault(
+        Some(self.place.fault(
             Cause::NotConnected,
             format!("nobody has connected to {} for {seconds} s", self.to()),
             format!("the controller at {}", self.info.host),
             "The controller's recipe client is off or has another address or port",
             "Enter this machine's address and this port at the pendant; open the port in the firewall",
-        )
+        ))
     }
 
     fn strangers(&self) -> Option<Finding> {
         let strangers = self.facts.map_or(0, |facts| facts.strangers);
         (strangers > 0 && !self.is_up()).then(|| {
-            self.found(
+            self.place.found(
                 Severity::Fault,
                 Cause::Stranger,
                 format!("{strangers} connections or datagrams from other addresses"),

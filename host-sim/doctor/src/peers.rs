@@ -47,7 +47,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
         // A request that is heard is no reply: eight bytes of a function that only reads.
         let is_request = |frame: &&[u8]| frame.len() == 8 && (1..=4).contains(&frame[1]) && frame[2] != 3;
         if frames.iter().any(|frame| frame[0] == peer.number && is_request(frame)) {
-            return seen.fault(
+            return seen.place.fault(
                 Cause::Echo,
                 format!("{asked}; the request itself is heard"),
                 expected,
@@ -57,7 +57,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
         }
         let known = |number: u8| seen.status.peers.iter().any(|peer| peer.number == number);
         if let Some(frame) = frames.iter().find(|frame| !known(frame[0])) {
-            return seen.fault(
+            return seen.place.fault(
                 Cause::PeerOther,
                 format!("{asked}; a right frame of slave {} is heard: {}", frame[0], HexBytes(shown(frame))),
                 expected,
@@ -71,7 +71,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
     }
     // With settings that were right once, nothing but its power and its wires is left.
     if peer.counters.replies > peer.counters.checksums.saturating_mul(10) {
-        return seen.fault(
+        return seen.place.fault(
             Cause::PeerSilent,
             format!("{asked}; it has answered before, and does not any more"),
             expected,
@@ -83,7 +83,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
         return noise(seen, peer);
     }
     if !bytes.is_empty() && seen.counters.bytes_in > 0 && seen.status.peers.len() == 1 {
-        return seen.fault(
+        return seen.place.fault(
             Cause::PeerSilent,
             format!(
                 "{asked}; {} heard: {}",
@@ -95,7 +95,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
             "Compare the settings of the port with the device's",
         );
     }
-    seen.fault(
+    seen.place.fault(
         Cause::PeerSilent,
         format!("{asked}; no byte of it"),
         expected,
@@ -105,7 +105,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
 }
 
 fn noise(seen: &PortCase<'_>, peer: Peer) -> Finding {
-    seen.fault(
+    seen.place.fault(
         Cause::ChecksumWrong,
         format!(
             "{} replies of {} with a wrong checksum, {} good ones",
@@ -122,7 +122,7 @@ fn refuses(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
         (true, code) if code > 0 => format!(": {} (code {code})", Exception::from_code(code)),
         _ => String::new(),
     };
-    seen.fault(
+    seen.place.fault(
         Cause::PeerRefuses,
         format!(
             "{} refuses {} of {} requests{why}",
@@ -145,7 +145,7 @@ fn served(seen: &PortCase<'_>, exchanges: &[Exchange], findings: &mut Vec<Findin
     let frames_of = seen.record.bytes();
     let frames = rtu_frames(&frames_of);
     if let Some(frame) = frames.iter().find(|frame| frame[0] != own && frame[0] != 0) {
-        findings.push(seen.fault(
+        findings.push(seen.place.fault(
             Cause::PeerOther,
             format!("requests to slave {}: {}", frame[0], HexBytes(shown(frame))),
             format!("requests to slave {own}"),

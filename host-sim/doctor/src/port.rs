@@ -66,7 +66,7 @@ impl PortCase<'_> {
             "" => "its device".to_owned(),
             device => device.to_owned(),
         };
-        self.fault(
+        self.place.fault(
             Cause::DeviceGone,
             format!("{device} is not there"),
             "",
@@ -140,7 +140,7 @@ impl PortCase<'_> {
             [] => "frames".to_owned(),
             head => format!("frames that begin with {}", HexBytes(head)),
         };
-        self.found(
+        self.place.found(
             severity,
             Cause::NoBytes,
             format!("0 bytes in {seconds} s{device}"),
@@ -155,7 +155,7 @@ impl PortCase<'_> {
 
     fn no_input(&self) -> Finding {
         let bytes = self.bytes();
-        self.warning(
+        self.place.warning(
             Cause::NoInput,
             format!("{}; first seen {}", self.came(), HexBytes(first(&bytes))),
             "nothing: the recipe has no input part",
@@ -177,14 +177,14 @@ impl PortCase<'_> {
                 counters.rejected_checksum
             );
             return match found {
-                Some(right) => Some(self.fault(
+                Some(right) => Some(self.place.fault(
                     Cause::ChecksumKind,
                     seen,
                     "the checksum of the recipe",
                     format!("The checksum is right as {right}"),
                     "Write that in `checksum` of the recipe",
                 )),
-                None => Some(self.fault(
+                None => Some(self.place.fault(
                     Cause::ChecksumWrong,
                     seen,
                     "the checksum of the recipe",
@@ -197,7 +197,7 @@ impl PortCase<'_> {
             return self.other_device(shape);
         }
         if self.are_many(counters.rejected_counter) {
-            return Some(self.fault(
+            return Some(self.place.fault(
                 Cause::Frozen,
                 format!("{} frames with the counter of the frame before", counters.rejected_counter),
                 "a counter that goes on",
@@ -248,7 +248,7 @@ impl PortCase<'_> {
             name => format!("{name:?}"),
         };
         let command = format!("host-sim decode {FILE} --recipe {name} --part input {}", HexBytes(&frame));
-        self.fault(
+        self.place.fault(
             Cause::BadValue,
             format!("{rejected}: {seen}"),
             expected,
@@ -277,7 +277,7 @@ impl PortCase<'_> {
             ),
             None => ("another constant".into(), "that of the recipe".into()),
         };
-        Some(self.fault(
+        Some(self.place.fault(
             Cause::OtherDevice,
             format!("{} whole frames with {seen}", self.counters.rejected_other_device),
             expected,
@@ -297,7 +297,7 @@ impl PortCase<'_> {
         } else {
             format!("Write endian = \"{other}\" in the part or the field of the recipe")
         };
-        self.fault(
+        self.place.fault(
             Cause::ByteOrder,
             format!("floats such as {read:e}; with their bytes reversed {swapped}"),
             format!("{own}-endian floats"),
@@ -321,28 +321,28 @@ impl PortCase<'_> {
         let whole = shape.len.map_or(String::new(), |len| format!("frames of {len} bytes, "));
         let Some(fit) = stream::fit(shape, bytes) else { return self.broken_off(shape) };
         match fit {
-            Fit::HeadSwapped { seen } => Some(self.fault(
+            Fit::HeadSwapped { seen } => Some(self.place.fault(
                 Cause::HeadSwapped,
                 format!("{came}; first seen {}", hex(&seen)),
                 format!("the head {}", hex(shape.head)),
                 "The bytes of the head are swapped",
                 format!("Write head = {} in the recipe, or change the device", list(&seen)),
             )),
-            Fit::HeadDiffers { seen } => Some(self.fault(
+            Fit::HeadDiffers { seen } => Some(self.place.fault(
                 Cause::HeadDiffers,
                 format!("{came}; frames begin with {}", hex(&seen)),
                 format!("the head {}", hex(shape.head)),
                 "The device's head is another one",
                 format!("Write head = {} in the recipe, or change the device", list(&seen)),
             )),
-            Fit::SevenBits => Some(self.fault(
+            Fit::SevenBits => Some(self.place.fault(
                 Cause::SevenBits,
                 format!("{came}; first seen {}", hex(first(bytes))),
                 format!("the head {}", hex(shape.head)),
                 "The head is there without bit 7: the device sends 7 data bits and parity",
                 "Set the device to 8 data bits",
             )),
-            Fit::TailDiffers { seen } => Some(self.fault(
+            Fit::TailDiffers { seen } => Some(self.place.fault(
                 Cause::TailDiffers,
                 format!("{came}; frames end with {}", hex(&seen)),
                 format!("the tail {}", hex(shape.tail)),
@@ -352,7 +352,7 @@ impl PortCase<'_> {
             Fit::Length { seen } => {
                 let len = shape.len.unwrap_or(0);
                 let (by, word) = (seen.abs_diff(len), if seen > len { "longer" } else { "shorter" });
-                Some(self.fault(
+                Some(self.place.fault(
                     Cause::LengthDiffers,
                     format!("{came}; frames of {seen} bytes"),
                     format!("{whole}head and tail included"),
@@ -360,7 +360,7 @@ impl PortCase<'_> {
                     "Correct the fields of the recipe: one is missing, too many, or of another type",
                 ))
             }
-            Fit::BrokenOff { seen } => Some(self.fault(
+            Fit::BrokenOff { seen } => Some(self.place.fault(
                 Cause::BrokenOff,
                 format!("{came}; after the head {} came {seen} bytes, then silence", hex(shape.head)),
                 format!("{whole}without a pause"),
@@ -395,7 +395,7 @@ impl PortCase<'_> {
             }
             false => format!("{} of {whole} bytes{age}, then silence: {bytes}", last.len),
         };
-        Some(self.warning(
+        Some(self.place.warning(
             Cause::BrokenOff,
             seen,
             expected,
@@ -433,7 +433,7 @@ impl PortCase<'_> {
         } else {
             "Bytes arrive, no head: baud rate or parity, or another protocol"
         };
-        self.fault(
+        self.place.fault(
             Cause::NoHead,
             format!("{came}; first seen {}; {high} % of the bytes above 7F", HexBytes(first(bytes))),
             match shape.head {
@@ -456,7 +456,7 @@ impl PortCase<'_> {
         let bad = bad.into_iter().max().unwrap_or(0);
         let is_much = bad >= 5 && bad.saturating_mul(10) > counters.frames_in;
         is_much.then(|| {
-            self.warning(
+            self.place.warning(
                 Cause::Noise,
                 format!("{} right frames and {bad} damaged ones", counters.frames_in),
                 "right frames only",
