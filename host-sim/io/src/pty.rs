@@ -16,7 +16,7 @@ use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, t
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use super::stream::ByteStream;
+use super::stream::{ByteStream, read_ready};
 use super::symlink::Symlink;
 use crate::reactor::register;
 
@@ -108,13 +108,7 @@ impl ByteStream for Pty {
     const LATE: bool = true;
 
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        loop {
-            self.readable().await?;
-            match self.try_read(buf) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                read => return read,
-            }
-        }
+        read_ready(|| self.readable(), || self.try_read(buf)).await
     }
 
     /// After less than `buf` holds, `receive` waits for more.

@@ -83,13 +83,7 @@ impl ByteStream for TcpStream {
     const LOSSY: bool = false;
 
     async fn receive(&self, buf: &mut [u8]) -> io::Result<usize> {
-        loop {
-            self.readable().await?;
-            match self.try_read(buf) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                read => return read,
-            }
-        }
+        read_ready(|| self.readable(), || self.try_read(buf)).await
     }
     fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
         Self::try_read(self, buf)
@@ -102,6 +96,20 @@ impl ByteStream for TcpStream {
     }
     fn has_unread(&self) -> bool {
         ioctl_fionread(self) != Ok(0)
+    }
+}
+
+/// Reads as soon as there is something. Cancel safe, as `readable` is.
+pub(super) async fn read_ready(
+    readable: impl AsyncFn() -> io::Result<()>,
+    mut try_read: impl FnMut() -> io::Result<usize>,
+) -> io::Result<usize> {
+    loop {
+        readable().await?;
+        match try_read() {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            read => return read,
+        }
     }
 }
 
