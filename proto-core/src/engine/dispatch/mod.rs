@@ -133,7 +133,7 @@ impl EngineView<'_> {
         self.clock.idle_until = Instant::ZERO;
         let now = self.clock.forward(now);
         if now >= self.clock.timer_at {
-            self.ask_all();
+            self.clock.dirty.add(Dirty::ALL);
         }
         if self.clock.dirty.has(Dirty::LINKS) && !self.clock.is_overdue {
             // To send a command, a connection may have to be closed first.
@@ -182,10 +182,6 @@ impl EngineView<'_> {
             "a port or link that was not asked has an output"
         );
         self.poll_sleep()
-    }
-
-    fn ask_all(&mut self) {
-        self.clock.dirty.add(Dirty::ALL);
     }
 
     /// The next request to a device, or sleep.

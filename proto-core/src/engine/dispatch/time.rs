@@ -10,8 +10,7 @@ use crate::engine::field::bindings::silence_commands;
 use crate::engine::field::port::FieldPort;
 use crate::engine::io::{Handled, Output};
 use crate::engine::link::links::LinksView;
-use crate::engine::values::store::Overdue;
-use crate::engine::values::store::Store;
+use crate::engine::values::store::{Overdue, Store};
 use crate::time::{Duration, Instant};
 
 /// When the engine has something to do without an input, computed exactly: without partial frames, and of these.
@@ -48,13 +47,9 @@ impl EngineView<'_> {
 
     /// Whether silence ends a partial frame; when it may, else.
     fn ends_partial(&mut self, now: Instant) -> bool {
-        self.clock.partial_at = self.partial_deadline();
+        let first = self.ports.iter().map(FieldPort::partial_until).min();
+        self.clock.partial_at = first.unwrap_or(Instant::NEVER);
         now >= self.clock.partial_at
-    }
-
-    /// When silence ends a partial frame, the first of all ports.
-    fn partial_deadline(&self) -> Instant {
-        self.ports.iter().map(FieldPort::partial_until).min().unwrap_or(Instant::NEVER)
     }
 
     /// Nothing is to be done until the next deadline or beat.
@@ -210,12 +205,9 @@ impl EngineView<'_> {
 
     /// Drops values that have waited too long.
     pub(crate) fn expire_waiting(&mut self) {
-        if self.store.may_expire() {
-            self.drop_expired();
+        if !self.store.may_expire() {
+            return;
         }
-    }
-
-    fn drop_expired(&mut self) {
         let ports = &mut *self.ports;
         self.store.expire_waiting(|port, dropped| {
             if let Some(port) = ports.get_mut(port) {

@@ -135,8 +135,8 @@ impl<'a> LinksView<'a> {
 
     /// When something happens without an input.
     pub(crate) fn deadline(self) -> Instant {
-        let mut first = self.find_deadline(LinkId::COMMAND);
-        first = first.min(self.find_deadline(LinkId::STATE)).min(self.find_deadline(LinkId::MODBUS));
+        let mut first = self.deadline_of(LinkId::COMMAND);
+        first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
         for link in self.recipes {
             first = first.min(link.deadline()).min(link.supervisor.deadline());
         }
@@ -148,10 +148,6 @@ impl<'a> LinksView<'a> {
 
     /// When something happens on one link without an input.
     pub(crate) fn deadline_of(self, id: LinkId) -> Instant {
-        self.find_deadline(id)
-    }
-
-    fn find_deadline(self, id: LinkId) -> Instant {
         let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
         let deadline = match id {
             LinkId::COMMAND | LinkId::URGENT => self.command.map(CommandLink::deadline),
@@ -238,7 +234,7 @@ impl Links<'_> {
         }
     }
 
-    /// Where a link of [`Self::infos`] goes; the host's name is written into `buf`.
+    /// Where a link of [`LinksView::infos`] goes; the host's name is written into `buf`.
     pub(crate) fn endpoint<'b>(&self, id: LinkId, buf: &'b mut [u8]) -> Endpoint<'b> {
         let to = self.view().infos().find(|info| info.id == id).map(|info| info.endpoint);
         let to = to.unwrap_or(Endpoint::new(Transport::Tcp { port: 0 }, ""));
@@ -455,11 +451,10 @@ impl Links<'_> {
     }
 
     /// The same, and the links that write one of these variables, which wait.
-    pub(crate) fn ask_for(&self, waiting: &InputSet, asked: Dirty) -> Dirty {
-        if waiting.is_empty() { asked } else { self.ask_writers(waiting, asked) }
-    }
-
-    fn ask_writers(&self, waiting: &InputSet, mut asked: Dirty) -> Dirty {
+    pub(crate) fn ask_for(&self, waiting: &InputSet, mut asked: Dirty) -> Dirty {
+        if waiting.is_empty() {
+            return asked;
+        }
         let is_wanted = |writes: &InputSet| !waiting.and(writes).is_empty();
         asked.add(Dirty::RECIPES.when(self.recipes.iter().any(|link| is_wanted(&link.writes))));
         asked.add(Dirty::MODBUS.when(self.modbus.first().is_some_and(|link| is_wanted(&link.writes))));

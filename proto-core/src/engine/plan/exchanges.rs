@@ -1,5 +1,7 @@
 //! The exchanges of a port, from the configuration.
 
+use heapless::VecView;
+
 use crate::config::{
     Bus, ConfigView, Counted, DeviceFrame, Echo, Exchange, FieldSpec, FrameSpec, OutcomeTo, Port, Recipe,
     Span, Transaction, has_values,
@@ -19,7 +21,6 @@ use crate::schedule::Grid;
 use crate::sysvar::Direction;
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanId;
-use heapless::VecView;
 
 /// Where the next fields are among the bindings of their direction, and the next input frame in the
 /// store.
