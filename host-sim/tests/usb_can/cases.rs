@@ -116,12 +116,18 @@ fn no_buffers() {
     adapter.becomes(Bus::Empty);
     let cell = Cell::of(&path);
     // Three in the adapter's mailboxes, ten in the driver, ten or eleven in the interface's queue. The others
-    // are refused repeatedly, and then given up.
-    let port = cell.port("given up", |port| port["device"]["dropped"].as_u64() > Some(0));
-    let count = |name: &str| port["device"][name].as_u64().unwrap();
-    let taken = count("frames_out");
-    assert!((23..26).contains(&taken) && count("refusals") > 0, "{port}");
-    assert_eq!(count("dropped"), FRAMES - taken, "{port}");
+    // are refused repeatedly, and then given up. On a slow machine the mailboxes take their frames late, so the
+    // last of those that wait belong to the second cycle.
+    let port = cell.port("given up", |port| {
+        let count = |name: &str| port["device"][name].as_u64().unwrap();
+        count("frames_out") >= 23 && count("dropped") > 0 && count("refusals") > 0
+    });
+    let taken = port["device"]["frames_out"].as_u64().unwrap();
+    assert!(taken < 26, "{port}");
+    cell.port("each is taken or given up", |port| {
+        let count = |name: &str| port["device"][name].as_u64().unwrap();
+        Some(count("frames_out") + count("dropped")) == port["frames_out"].as_u64()
+    });
     cell.looks_on(|port| assert_eq!(port["device"]["frames_out"], taken, "no more wait: {port}"));
     assert_eq!((&port["downs"], &port["device"]["ups"]), (&0.into(), &1.into()), "{port}");
 
@@ -137,7 +143,11 @@ fn no_buffers() {
         // On a machine that is slow for 100 ms, the rest of a later cycle may be given up, too.
         assert_eq!(*cycle, &whole[..cycle.len()], "in order: {sent:?}");
     }
-    assert_eq!(cycles[0].len() as u64, taken, "those that waited: {sent:?}");
+    let sums = cycles.iter().scan(0, |sum, cycle| {
+        *sum += cycle.len() as u64;
+        Some(*sum)
+    });
+    assert!(sums.into_iter().any(|sum| sum == taken), "{taken} that waited: {sent:?}");
     assert!(cycles[1..].contains(&whole.as_slice()), "a whole one, however often it was refused: {sent:?}");
     cell.end();
 }
