@@ -31,8 +31,8 @@ mod values;
 pub use build_error::{BuildError, PlanError};
 pub use clock::ASLEEP;
 pub use counters::{LinkCounters, PortCounters};
-pub use field::events::Outcome;
-pub use field::line::{EventCounters, PeerCounters};
+pub use field::event::Outcome;
+pub use field::peer_counters::{EventCounters, PeerCounters};
 pub use field::rules::{Taken, judge_field};
 pub use io::{
     BusState, Endpoint, Handled, Input, LinkId, LinkKind, Output, PortId, PortState, ReplyCode, Transport,
@@ -57,9 +57,8 @@ use dispatch::{EngineView, hold};
 use field::bindings::{Bindings, InputBind, OutputBind, Sendable};
 use field::exchanges::{ExchangeItem, Exchanges, Piece};
 use field::health::{PortsHealth, state_of};
-use field::line::PeerState;
 use field::port::{FieldPort, find_port};
-use field::turns::Row;
+use field::turns::{PeerState, Row};
 use link::command::CommandLink;
 use link::device::DeviceLink;
 use link::links::{Links, LinksView, MAX_HOST, Maybe};

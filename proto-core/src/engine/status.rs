@@ -9,11 +9,13 @@ use core::fmt;
 
 use super::counters::PortCounters;
 use super::field::bindings::InputBind;
+use super::field::codec::Codec;
 use super::field::health::PortsHealth;
-use super::field::line::{PeerCounters, PeerState};
-use super::field::port::{Codec, FieldPort};
+use super::field::peer_counters::PeerCounters;
+use super::field::port::FieldPort;
 use super::field::rules::allowed;
-use super::field::whole::TextBind;
+use super::field::texts::TextBind;
+use super::field::turns::PeerState;
 use super::io::{BusState, LinkKind, PortId, PortState, ReplyCode};
 use super::latency::Latency;
 use super::link::dropped::DroppedCommand;

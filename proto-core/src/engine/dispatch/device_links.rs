@@ -3,7 +3,7 @@
 use super::EngineView;
 use crate::engine::clock::Dirty;
 use crate::engine::counters::{add, bump};
-use crate::engine::field::events::Event;
+use crate::engine::field::event::Event;
 use crate::engine::field::port::find_port;
 use crate::engine::field::turns::Cause;
 use crate::engine::io::{LinkId, PortId};

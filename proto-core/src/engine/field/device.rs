@@ -6,16 +6,18 @@
 use heapless::Vec;
 
 use super::bindings::{InputBind, Outputs};
+use super::codec::{Codec, DeviceCodec, MAX_DEVICE_FRAMES, Reader};
+use super::format::{DeviceFormat, judge, judge_can, probe, probe_all};
 use super::frames::{Accepted, FrameContext};
-use super::line::Line;
+use super::outgoing::Outgoing;
 use super::output::Downward;
-use super::port::{Codec, FieldPort, came, keep_why};
+use super::port::{FieldPort, came, keep_why};
 use super::sender::{DIGEST_SEED, digest};
-use super::whole::{MAX_TEXTS, Outgoing, Reader, TextBind, texts_of};
+use super::texts::{MAX_TEXTS, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Rs485, Span};
-use crate::device::{Cutter, Element, Escape, Found, FrameLayout, Framer, Probe};
+use crate::device::{Cutter, Found, Framer, Piece, Probe};
 use crate::engine::build_error::{BuildError, one_too_many};
-use crate::engine::counters::bump;
+use crate::engine::counters::{add, bump};
 use crate::engine::link::command::CommandLink;
 use crate::engine::rejection::Rejection;
 use crate::engine::tap::Tap;
@@ -24,109 +26,6 @@ use crate::image::Image;
 use crate::sysvar::Direction;
 use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId};
-
-/// Maximum number of frames of one port with a device's own frames, both ways together.
-pub(crate) const MAX_DEVICE_FRAMES: usize = 18;
-
-/// One frame of the device.
-#[derive(Debug, Clone)]
-pub(crate) struct DeviceFormat {
-    pub layout: FrameLayout,
-    /// Its id on a CAN bus.
-    pub id: CanId,
-    /// Its range of the bindings of its direction, which have its elements.
-    pub bindings: Span,
-}
-
-/// The frames of a device, and what finds them in a stream.
-#[derive(Debug, Clone)]
-pub(crate) struct DeviceCodec {
-    /// The input frames, then the output frames.
-    pub formats: Vec<DeviceFormat, MAX_DEVICE_FRAMES>,
-    pub inputs: u8,
-    /// `None` on a CAN bus.
-    pub reader: Option<Reader>,
-    /// What output frames are sent with.
-    pub escape: Option<Escape>,
-    pub texts: Vec<TextBind, MAX_TEXTS>,
-    /// Bytes outside whole frames that have been counted.
-    pub skipped_bytes: u32,
-    /// The line of the exchanges, if the recipe has any.
-    pub line: Option<Line>,
-}
-
-impl DeviceCodec {
-    /// Whether silence has something to end.
-    pub(crate) fn has_begun(&self) -> bool {
-        self.reader.as_ref().is_some_and(Reader::has_begun)
-    }
-
-    /// Number of bindings of the input frames, and of the output frames.
-    pub(crate) fn fields(&self) -> (u16, u16) {
-        let sum = |formats: &[DeviceFormat]| {
-            formats.iter().map(|format| format.bindings.len).fold(0, u16::saturating_add)
-        };
-        (sum(self.input()), sum(self.output()))
-    }
-
-    fn input(&self) -> &[DeviceFormat] {
-        self.formats.get(..usize::from(self.inputs)).unwrap_or(&[])
-    }
-
-    fn output(&self) -> &[DeviceFormat] {
-        self.formats.get(usize::from(self.inputs)..).unwrap_or(&[])
-    }
-}
-
-/// What the bytes are, seen as any of the frames: a frame wins over more bytes that are needed, and
-/// these over a wrong checksum.
-fn probe_all(formats: &[DeviceFormat], bindings: &[InputBind], bytes: &[u8]) -> Probe {
-    let probes = formats.iter().map(|format| probe(format, bindings, bytes));
-    probes.fold(Probe::No(0), better)
-}
-
-/// What bytes are that can be seen in two ways.
-pub(crate) fn better(one: Probe, other: Probe) -> Probe {
-    match (one, other) {
-        (Probe::Frame(len), _) | (_, Probe::Frame(len)) => Probe::Frame(len),
-        (Probe::Other(len), _) | (_, Probe::Other(len)) => Probe::Other(len),
-        (Probe::Partial(one), Probe::Partial(other)) => Probe::Partial(one.min(other)),
-        (Probe::Partial(missing), _) | (_, Probe::Partial(missing)) => Probe::Partial(missing),
-        (Probe::Wrong(len), _) | (_, Probe::Wrong(len)) => Probe::Wrong(len),
-        (Probe::No(one), Probe::No(other)) => Probe::No(one.saturating_add(other)),
-    }
-}
-
-pub(crate) fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8]) -> Probe {
-    format.layout.probe(elements(format.bindings.of(bindings)), bytes)
-}
-
-/// The frame that CAN data with this id are, or why they are none: frames with one id differ in
-/// constants.
-pub(crate) fn judge_can<'f, T>(
-    formats: impl Iterator<Item = (T, &'f DeviceFormat)>,
-    bindings: &[InputBind],
-    frame: &CanFrame,
-) -> Result<(T, &'f DeviceFormat), Rejection> {
-    let mut why = Rejection::ForeignId;
-    for (what, format) in formats.filter(|(_, format)| format.id == frame.id()) {
-        let fields = elements(format.bindings.of(bindings));
-        let probe = format.layout.probe_whole(fields, frame.data());
-        why = match (probe, why) {
-            (Probe::Frame(_), _) => return Ok((what, format)),
-            // Right but for a constant: another one than this, whatever the others are.
-            (Probe::Other(_), _) | (_, Rejection::OtherDevice) => Rejection::OtherDevice,
-            (Probe::Wrong(_), _) | (_, Rejection::Checksum) => Rejection::Checksum,
-            (Probe::No(_), _) if frame.data().len() == format.layout.lengths().0 => Rejection::OtherDevice,
-            _ => Rejection::WrongLength,
-        };
-    }
-    Err(why)
-}
-
-pub(crate) fn elements(bindings: &[InputBind]) -> impl Iterator<Item = Element> {
-    bindings.iter().map(InputBind::element)
-}
 
 impl DeviceCodec {
     /// The frames of a recipe, whose bindings will begin at these places.
@@ -188,8 +87,40 @@ impl DeviceCodec {
     }
 }
 
+/// A frame that was found, as one of these formats.
+type AsFormat<'f> = Result<(usize, &'f DeviceFormat), Rejection>;
+
+fn found_by_search<'f, 'b>(
+    found: Found<'b>,
+    formats: &'f [DeviceFormat],
+    bindings: &[InputBind],
+) -> (&'b [u8], AsFormat<'f>) {
+    match found {
+        Found::Frame(frame) => {
+            let is_this = |format: &&DeviceFormat| matches!(probe(format, bindings, frame), Probe::Frame(len) if len == frame.len());
+            let found = (0..).zip(formats).find(|(_, format)| is_this(format));
+            (frame, found.ok_or(Rejection::NoFrame))
+        }
+        Found::Other(frame) => (frame, Err(Rejection::OtherDevice)),
+        Found::Wrong(frame) => (frame, Err(Rejection::Checksum)),
+    }
+}
+
+fn found_whole<'f, 'b>(
+    piece: Piece<'b>,
+    formats: &'f [DeviceFormat],
+    bindings: &[InputBind],
+) -> (&'b [u8], AsFormat<'f>) {
+    match piece {
+        Piece::Whole(frame) => (frame, judge(formats, bindings, frame)),
+        Piece::TooLong(frame) => (frame, Err(Rejection::WrongLength)),
+        Piece::BadEscape(frame) => (frame, Err(Rejection::Escape)),
+        Piece::Cut(frame) => (frame, Err(Rejection::Partial)),
+    }
+}
+
 impl FieldPort {
-    /// Reads the frames in `rest`; see [`FieldPort::frames`].
+    /// Reads the frames in `rest`, or the one that silence has ended if it is empty; see [`FieldPort::frames`].
     pub(crate) fn device_frames(
         &mut self,
         rest: &mut &[u8],
@@ -201,46 +132,56 @@ impl FieldPort {
         let mut accepted = Accepted::default();
         let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
         let mut left = core::mem::take(rest);
-        let framer = match &mut self.codec {
-            Codec::Device(DeviceCodec { inputs: 0, .. }) => {
-                self.not_asked_for(bytes, tap, now);
-                return accepted;
-            }
-            Codec::Device(DeviceCodec { reader: Some(Reader::Whole { .. }), .. }) => {
-                *rest = bytes;
-                return self.whole_frames(rest, bindings, store, commands, tap);
-            }
-            Codec::Device(DeviceCodec {
-                formats,
-                inputs,
-                texts,
-                reader: Some(Reader::Search(framer)),
-                ..
-            }) => Some((formats.get(..usize::from(*inputs)).unwrap_or(&[]), texts, framer)),
-            _ => None,
+        if matches!(self.codec, Codec::Device(DeviceCodec { inputs: 0, .. })) {
+            self.not_asked_for(bytes, tap, now);
+            return accepted;
+        }
+        self.discard_waiting(bytes, tap, now);
+        let Codec::Device(DeviceCodec { formats, inputs, texts, reader: Some(reader), .. }) = &mut self.codec
+        else {
+            return accepted;
         };
-        let Some((formats, texts, framer)) = framer else { return accepted };
-        let (reply, counters) = (&mut self.reply, &mut self.counters);
-        let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
+        let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
+        let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
         let effort = formats
             .iter()
-            .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)));
-        let effort = effort.fold(0, usize::saturating_add);
-        while let Some(found) =
-            framer.next_frame(&mut left, effort, |bytes| probe_all(formats, bindings, bytes))
+            .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
+            .fold(0, usize::saturating_add);
+        let (reply, counters) = (&mut self.reply, &mut self.counters);
+        let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
+        if let Reader::Whole { heard, .. } = reader
+            && !bytes.is_empty()
         {
-            let (frame, verdict) = match found {
-                Found::Frame(frame) => {
-                    let is_this = |format: &&DeviceFormat| matches!(probe(format, bindings, frame), Probe::Frame(len) if len == frame.len());
-                    let taken =
-                        (0..).zip(formats).find(|(_, format)| is_this(format)).map(|(nth, format)| {
-                            let slot = usize::from(self.first_frame).saturating_add(nth);
-                            frames.take_device(format, texts, frame, slot, &mut accepted)
-                        });
-                    (frame, taken.unwrap_or(Err(Rejection::NoFrame)))
+            *heard = now;
+        }
+        let mut is_silent = bytes.is_empty();
+        loop {
+            let found = match reader {
+                Reader::Search(framer) => {
+                    let found =
+                        framer.next_frame(&mut left, effort, |bytes| probe_all(formats, bindings, bytes));
+                    found.map(|found| found_by_search(found, formats, bindings))
                 }
-                Found::Other(frame) => (frame, frames.rejected(Rejection::OtherDevice)),
-                Found::Wrong(frame) => (frame, frames.rejected(Rejection::Checksum)),
+                Reader::Whole { cutter, .. } => {
+                    let is_silent = core::mem::take(&mut is_silent);
+                    let piece = if is_silent { cutter.silence() } else { cutter.next_piece(&mut left, tail) };
+                    piece.map(|piece| found_whole(piece, formats, bindings))
+                }
+                Reader::Slave(_) => None,
+            };
+            let Some((frame, found)) = found else { break };
+            let verdict = match found {
+                Ok((nth, format)) => {
+                    let slot = usize::from(self.first_frame).saturating_add(nth);
+                    frames.take_device(format, texts, frame, slot, &mut accepted)
+                }
+                // The search counts what is no frame, and these bytes are lost for the second time.
+                Err(why @ Rejection::NoFrame) => Err(why),
+                Err(why @ Rejection::Partial) => {
+                    add(&mut frames.counters.discarded_bytes, frame.len());
+                    Err(why)
+                }
+                Err(why) => frames.rejected(why),
             };
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
@@ -255,21 +196,66 @@ impl FieldPort {
         accepted
     }
 
-    /// Counts what the search for frames has skipped, in these bytes or those held before.
+    /// Bytes that come when silence is overdue may have waited: nobody knows whether there was silence before them. What
+    /// had begun is discarded.
+    fn discard_waiting(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
+        if let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, heard }), .. }) = &self.codec
+            && cutter.ends_by_silence()
+            && cutter.has_begun()
+            && !bytes.is_empty()
+            && now >= *heard + self.line.idle_gap
+        {
+            self.discard_partial(tap, now);
+        }
+    }
+
+    /// Counts what belongs to no frame, in these bytes or those held before.
     pub(crate) fn note_skipped(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
-        let Codec::Device(DeviceCodec { reader: Some(Reader::Search(framer)), skipped_bytes, .. }) =
+        let Codec::Device(DeviceCodec { reader: Some(reader), skipped_bytes, .. }) = &mut self.codec else {
+            return;
+        };
+        let skipped = match reader {
+            Reader::Search(framer) => {
+                let stats = framer.stats();
+                self.counters.resync_bytes = stats.skipped_bytes;
+                // The bytes of a frame with a wrong checksum were reported as that.
+                let noise = stats.noise_bytes.wrapping_sub(*skipped_bytes);
+                *skipped_bytes = stats.noise_bytes;
+                noise
+            }
+            Reader::Whole { cutter, .. } => {
+                let skipped = cutter.skipped_bytes().wrapping_sub(*skipped_bytes);
+                *skipped_bytes = cutter.skipped_bytes();
+                add(&mut self.counters.resync_bytes, skipped as usize);
+                skipped
+            }
+            Reader::Slave(_) => 0,
+        };
+        if skipped > 0 {
+            self.no_frame(bytes, skipped as usize, tap, now);
+        }
+    }
+
+    /// Whether silence ends frames on this port, and one has begun.
+    pub(crate) fn ends_by_silence(&self) -> bool {
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, .. }), .. }) = &self.codec
+        else {
+            return false;
+        };
+        cutter.ends_by_silence() && cutter.has_begun()
+    }
+
+    /// These bytes are lost; what they began cannot be trusted.
+    pub(crate) fn lose(&mut self, bytes: &[u8]) {
+        let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, .. }), formats, .. }) =
             &mut self.codec
         else {
             return;
         };
-        let stats = framer.stats();
-        self.counters.resync_bytes = stats.skipped_bytes;
-        // The bytes of a frame with a wrong checksum were reported as that.
-        let noise = stats.noise_bytes.wrapping_sub(*skipped_bytes);
-        if noise > 0 {
-            *skipped_bytes = stats.noise_bytes;
-            self.no_frame(bytes, noise as usize, tap, now);
-        }
+        let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
+        let mut rest = bytes;
+        while cutter.next_piece(&mut rest, tail).is_some() {}
+        cutter.discard();
     }
 
     /// A frame from the bus; see [`FieldPort::can`].

@@ -5,10 +5,10 @@
 //! with a wrong alive counter, is rejected as a whole (docs/engine.md section 11).
 
 use super::bindings::{InputBind, InputTo, Written};
-use super::device::{DeviceFormat, elements};
+use super::format::{DeviceFormat, elements};
 use super::frames::{Accepted, FrameContext};
 use super::rules::{Rules, Taken};
-use super::whole::TextBind;
+use super::texts::TextBind;
 use crate::device::{Encoding, Overflow, Unreadable};
 use crate::engine::counters::{add, bump};
 use crate::engine::rejection::{FieldRejection, Rejection};

@@ -6,157 +6,15 @@
 //! A rise needs a 0 that was read before it over the same connection, and that is not stale. Values that are read apart
 //! from the bit come from a read that was answered after the one that showed the rise.
 
+use super::event::{Event, Outcome, Reading};
 use super::exchanges::{ExchangeItem, Piece};
-use super::line::{EventCounters, ExchangeTable, Line};
+use super::line::{ExchangeTable, Line};
 use super::requests::Maker;
 use super::turns::{Ended, News, Turns};
 use crate::image::GroupId;
 use crate::modbus::rtu::MAX_ADU;
 use crate::recipe::model::MAX_STREAM_FRAME;
-use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
-
-/// What became of an event, as the robot is told (docs/engine.md section 13).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
-#[repr(u8)]
-#[non_exhaustive]
-pub enum Outcome {
-    /// There was no event yet.
-    #[default]
-    None = 0,
-    /// It waits, or is on its way.
-    Open = 1,
-    /// The device confirmed it.
-    Done = 2,
-    /// The device refused it.
-    Refused = 3,
-    /// The device accepted it, and takes its time (Modbus exception 5).
-    Accepted = 4,
-    /// It was sent, and no answer tells what became of it.
-    Unknown = 5,
-    /// It could not be sent in time.
-    Expired = 6,
-    /// It was not sent: a value is outside its limits.
-    OutOfLimits = 7,
-    /// It was not sent: a value is unknown or stale.
-    NoValue = 8,
-    /// It was not sent: the device is away.
-    Away = 9,
-    /// It was not sent: the event before it was still open.
-    StillOpen = 10,
-    /// It was not sent: a write that stops the device came first.
-    Stopped = 11,
-    /// It was not sent: the step before it was not done.
-    NotFollowed = 12,
-}
-
-/// The bit that triggers an exchange.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Trigger {
-    pub var: SysVar,
-    pub bit: u8,
-    /// The newest reading.
-    last: Option<Reading>,
-}
-
-/// A reading of a bit.
-#[derive(Debug, Clone, Copy)]
-struct Reading {
-    on: bool,
-    at: Instant,
-}
-
-/// The event of an exchange.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Event {
-    /// There is none.
-    Over,
-    /// It happened at `at`, and newer values are pending.
-    Risen { at: Instant, until: Instant },
-    /// Its request is made, and it follows an exchange that is not done yet.
-    Behind { len: u16, until: Instant },
-    /// Its request is made.
-    Ready { len: u16, until: Instant },
-    /// It is on its way.
-    Sent { len: u16, until: Instant },
-}
-
-/// What is reported to the robot of an exchange's events.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct ReportedOutcome {
-    pub outcome: Outcome,
-    /// With which code the device refused it.
-    pub code: u16,
-    /// Events that have ended, wrapping.
-    pub ended: u16,
-}
-
-impl Trigger {
-    pub(crate) const fn new((var, bit): (SysVar, u8)) -> Self {
-        Self { var, bit, last: None }
-    }
-
-    /// The next reading is the first one.
-    pub(crate) const fn forget(&mut self) {
-        self.last = None;
-    }
-
-    /// Takes a reading over the connection that is up since then. Returns whether the bit has risen, for an event, and for
-    /// a write that stops, which does not need to know that it was 0.
-    fn read(&mut self, reading: Reading, up_since: Instant, stale_after: Duration) -> [bool; 2] {
-        let before = self.last.replace(reading);
-        if !reading.on {
-            return [false; 2];
-        }
-        // By its time: what an earlier connection brought may be looked at again while this one is up.
-        let before = before.filter(|before| before.at >= up_since);
-        let was_off =
-            before.is_some_and(|before| !before.on && reading.at.saturating_since(before.at) <= stale_after);
-        // What happened between two connections nobody knows.
-        [was_off, !before.is_some_and(|before| before.on)]
-    }
-}
-
-impl Event {
-    pub(crate) const fn is_over(self) -> bool {
-        matches!(self, Self::Over)
-    }
-
-    /// Whether it waits, and is not on its way.
-    pub(crate) const fn waits(self) -> bool {
-        matches!(self, Self::Risen { .. } | Self::Behind { .. } | Self::Ready { .. })
-    }
-
-    /// Until when it may be sent, while it waits.
-    pub(crate) const fn expires_at(self) -> Instant {
-        match self {
-            Self::Risen { until, .. } | Self::Behind { until, .. } | Self::Ready { until, .. } => until,
-            Self::Over | Self::Sent { .. } => Instant::NEVER,
-        }
-    }
-}
-
-impl EventCounters {
-    fn count(&mut self, outcome: Outcome) {
-        let counter = match outcome {
-            Outcome::None | Outcome::Open => return,
-            Outcome::Done => &mut self.done,
-            Outcome::Refused => &mut self.refused,
-            Outcome::Accepted => &mut self.accepted,
-            Outcome::Unknown => &mut self.unknown,
-            Outcome::Expired => &mut self.expired,
-            Outcome::OutOfLimits => &mut self.out_of_limits,
-            Outcome::NoValue => &mut self.no_value,
-            Outcome::Away => &mut self.away,
-            Outcome::StillOpen => &mut self.still_open,
-            Outcome::Stopped => &mut self.stopped,
-            Outcome::NotFollowed => &mut self.not_followed,
-        };
-        *counter = counter.wrapping_add(1);
-    }
-}
 
 /// What the values of requests are read from, as far as their age matters.
 pub(crate) struct Sources<C> {

@@ -5,18 +5,20 @@
 //! exchanges do not come here.
 
 use super::bindings::{InputBind, Outputs};
-use super::device::{DeviceCodec, DeviceFormat, elements, judge_can};
-use super::events::{Events, Outcome, Sources};
+use super::codec::{Codec, DeviceCodec, Reader};
+use super::event::Outcome;
+use super::events::{Events, Sources};
 use super::exchanges::{Asks, ExchangeItem, OtherFormat, View};
+use super::format::{DeviceFormat, elements, judge_can};
 use super::frames::{Accepted, FrameContext};
 use super::line::{ExchangeTable, Flight, Line, Over, Phase, Times};
 use super::modbus_tcp;
 use super::output::Downward;
 use super::pending::{Heard, PendingReplies};
-use super::port::{Codec, FieldPort, came, keep_why};
+use super::port::{FieldPort, came, keep_why};
 use super::requests::Maker;
+use super::texts::TextBind;
 use super::turns::{Cause, Ended, News};
-use super::whole::{Reader, TextBind};
 use crate::device::{Found, Probe};
 use crate::engine::counters::{PortCounters, add, bump};
 use crate::engine::link::command::CommandLink;
@@ -24,7 +26,6 @@ use crate::engine::rejection::Rejection;
 use crate::engine::tap::Tap;
 use crate::engine::values::store::Store;
 use crate::image::{GroupId, Image};
-use crate::modbus::rtu::MAX_ADU;
 use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId};
 
@@ -129,16 +130,14 @@ impl FieldPort {
                 bindings,
                 now,
             };
-            let effort = pending.all();
-            let effort = effort
-                .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
-                .fold(MAX_ADU, usize::saturating_add);
             let is_tcp = line.transactions.is_some();
             let probe = |bytes: &[u8]| if is_tcp { modbus_tcp::probe(bytes) } else { pending.probe(bytes) };
-            let Some(found) = framer.next_frame(&mut left, effort, probe) else { break };
-            let (frame, what) = match (found, &mut line.transactions) {
-                (Found::Frame(frame), None) => (frame, Ok(pending.heard(frame))),
-                (Found::Frame(frame), Some(all)) => (frame, Ok(all.heard(&pending, frame))),
+            let Some(found) = framer.next_frame(&mut left, pending.effort(), probe) else { break };
+            let (frame, heard) = match (found, &mut line.transactions) {
+                (Found::Frame(frame), None) => (frame, pending.heard(frame).ok_or(Rejection::NoFrame)),
+                (Found::Frame(frame), Some(all)) => {
+                    (frame, pending.heard_on_tcp(all, frame).ok_or(Rejection::OtherDevice))
+                }
                 (Found::Other(frame), None) => (frame, Err(Rejection::OtherDevice)),
                 (Found::Other(frame), Some(all)) => {
                     // Nothing behind it can be read.
@@ -150,58 +149,23 @@ impl FieldPort {
                     (frame, Err(Rejection::Checksum))
                 }
             };
-            let what = match what {
-                Ok(what) => what,
-                Err(why) => {
-                    let verdict = frames.rejected(why);
-                    tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
-                    keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
-                    continue;
-                }
-            };
-            if let Some(Heard::Echo) = what {
+            if let Ok(Heard::Echo) = heard {
                 line.echo = None;
                 learn_echo(line, &mut table, true, now);
                 continue;
             }
-            let expected = pending.expected();
             let (flight, times) = (pending.flight, pending.asked().map(|item| item.times));
-            let answer = match is_tcp {
-                true => modbus_tcp::content(frame),
-                false => (frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]), frame.get(2).copied()),
-            };
-            let answer = match expected {
-                Some(_) => {
-                    Answer { data: answer.0, code: answer.1.unwrap_or(0).into(), is_modbus: true, is_tcp }
-                }
-                None => Answer { data: frame, code: 0, is_modbus: false, is_tcp },
-            };
+            let answer = Answer::of(frame, pending.expected().is_some(), is_tcp);
             let before = accepted.frames;
-            let Taken { verdict, sign, told } = match what {
-                Some(what) => take_heard(&mut frames, texts, what, (flight, frame, answer), &mut accepted),
-                None if is_tcp => Taken::nothing(frames.rejected(Rejection::OtherDevice)),
-                None => Taken::nothing(Err(Rejection::NoFrame)),
+            let taken = match heard {
+                Ok(heard) => take_heard(&mut frames, texts, heard, (flight, frame, answer), &mut accepted),
+                // The search counts it.
+                Err(why @ Rejection::NoFrame) => Taken::nothing(Err(why)),
+                Err(why) => Taken::nothing(frames.rejected(why)),
             };
-            if let Some(told) = told.filter(|_| verdict.is_ok()) {
-                look_for_restart(line, items, &mut table, bindings, told, now);
-            }
-            match (sign, flight, times) {
-                (Sign::Pending, Some(flight), Some(times)) => {
-                    goes_on(line, items, &mut table, (flight, times), now);
-                }
-                (Sign::Answer(ended, code), Some(flight), Some(times)) => {
-                    // Of a repetition, two copies may be the replies to both requests.
-                    let is_sure = !flight.is_repetition() && !is_outstanding(&table, flight, now);
-                    if is_sure && (flight.may_be_echo || line.echo.is_some()) {
-                        learn_echo(line, &mut table, flight.may_be_echo, now);
-                    }
-                    if matches!(line.phase, Phase::Waiting(_)) {
-                        self.sender.sent();
-                    }
-                    answered(line, items, &mut table, frames.counters, (flight, times), (ended, code), now);
-                }
-                (Sign::ReplyOrEcho, ..) => line.heard_reply_or_echo(),
-                (sign, ..) => signs(line, items, &mut table, sign, now),
+            let verdict = taken.verdict;
+            if heed(line, items, &mut table, (bindings, frames.counters), taken, (flight, times), now) {
+                self.sender.sent();
             }
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
@@ -279,7 +243,7 @@ impl FieldPort {
         };
         let times = pending.asked().map(|item| item.times);
         let of_reply = Answer { data: frame.data(), code, is_modbus: false, is_tcp: false };
-        let Taken { verdict, sign, told } = match pending.classify(answer, is, |_| false) {
+        let taken = match pending.classify(answer, is, |_| false) {
             Some(heard) => take_heard(&mut frames, texts, heard, (flight, frame.data(), of_reply), accepted),
             None => {
                 let answers = pending.answers().map(|format| (None, format));
@@ -299,18 +263,8 @@ impl FieldPort {
                 return Ok(());
             }
         };
-        if let Some(told) = told.filter(|_| verdict.is_ok()) {
-            look_for_restart(line, items, &mut table, bindings, told, now);
-        }
-        match (sign, flight, times) {
-            (Sign::Pending, Some(flight), Some(times)) => {
-                goes_on(line, items, &mut table, (flight, times), now);
-            }
-            (Sign::Answer(ended, code), Some(flight), Some(times)) => {
-                answered(line, items, &mut table, frames.counters, (flight, times), (ended, code), now);
-            }
-            (sign, ..) => signs(line, items, &mut table, sign, now),
-        }
+        let verdict = taken.verdict;
+        heed(line, items, &mut table, (bindings, frames.counters), taken, (flight, times), now);
         verdict
     }
 
@@ -513,6 +467,20 @@ struct Answer<'f> {
     is_tcp: bool,
 }
 
+impl<'f> Answer<'f> {
+    /// The answer in a frame that was found in a stream.
+    fn of(frame: &'f [u8], is_modbus: bool, is_tcp: bool) -> Self {
+        if !is_modbus {
+            return Self { data: frame, code: 0, is_modbus, is_tcp: false };
+        }
+        let (data, code) = match is_tcp {
+            true => modbus_tcp::content(frame),
+            false => (frame.get(3..frame.len().saturating_sub(2)).unwrap_or(&[]), frame.get(2).copied()),
+        };
+        Self { data, code: code.unwrap_or(0).into(), is_modbus, is_tcp }
+    }
+}
+
 /// What became of a frame.
 struct Taken<'f> {
     verdict: Result<(), Rejection>,
@@ -565,6 +533,37 @@ fn take_heard<'f>(
         Heard::Echo => (Err(Rejection::NoFrame), Sign::Nothing),
     };
     Taken { verdict, sign, told }
+}
+
+/// What a frame that was taken says of the exchanges. Returns whether the line waited for it.
+fn heed(
+    line: &mut Line,
+    items: &mut [ExchangeItem],
+    table: &mut ExchangeTable<'_>,
+    (bindings, counters): (&[InputBind], &mut PortCounters),
+    taken: Taken<'_>,
+    (flight, times): (Option<Flight>, Option<Times>),
+    now: Instant,
+) -> bool {
+    if let Some(told) = taken.told.filter(|_| taken.verdict.is_ok()) {
+        look_for_restart(line, items, table, bindings, told, now);
+    }
+    match (taken.sign, flight, times) {
+        (Sign::Pending, Some(flight), Some(times)) => goes_on(line, items, table, (flight, times), now),
+        (Sign::Answer(ended, code), Some(flight), Some(times)) => {
+            // Of a repetition, two copies may be the replies to both requests.
+            let is_sure = !flight.is_repetition() && !is_outstanding(table, flight, now);
+            if is_sure && (flight.may_be_echo || line.echo.is_some()) {
+                learn_echo(line, table, flight.may_be_echo, now);
+            }
+            let was_waiting = matches!(line.phase, Phase::Waiting(_));
+            answered(line, items, table, counters, (flight, times), (ended, code), now);
+            return was_waiting;
+        }
+        (Sign::ReplyOrEcho, ..) => line.heard_reply_or_echo(),
+        (sign, ..) => signs(line, items, table, sign, now),
+    }
+    false
 }
 
 /// What a refusal means; on Modbus its code tells (docs/wire/modbus-rtu.md section 4).

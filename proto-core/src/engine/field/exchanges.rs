@@ -5,10 +5,10 @@
 
 use heapless::VecView;
 
-use super::device::DeviceFormat;
-use super::events::{Event, ReportedOutcome, Trigger};
-use super::line::{ExchangeTable, Line, PeerState, Times};
-use super::turns::Row;
+use super::event::{Event, ReportedOutcome, Trigger};
+use super::format::DeviceFormat;
+use super::line::{ExchangeTable, Line, Times};
+use super::turns::{PeerState, Row};
 use crate::config::{FieldSpec, OutcomeTo, Restarted, Span};
 use crate::modbus::rtu::{Operation, Table};
 use crate::time::Duration;

@@ -2,8 +2,8 @@
 
 use heapless::Vec;
 
-use super::line::PeerState;
 use super::port::FieldPort;
+use super::turns::PeerState;
 use crate::config::{MAX_PORTS, PortValue};
 use crate::engine::io::{LinkId, PortState};
 use crate::engine::values::store::InputFrame;

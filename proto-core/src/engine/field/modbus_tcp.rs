@@ -4,7 +4,6 @@
 //! In: requests without a header, and what came on the connection. Out: frames, and what they are. A reply belongs to
 //! the request with its transaction id, so nothing waits for late replies here.
 
-use super::pending::{Heard, PendingReplies};
 use crate::device::Probe;
 use crate::modbus::adu::{PREFIX_LEN, frame_len};
 use crate::modbus::rtu::CRC_LEN;
@@ -19,7 +18,7 @@ const ANSWERED: u8 = u8::MAX;
 #[derive(Debug, Clone)]
 pub(crate) struct Transactions {
     /// The id of the newest request. It goes on over connections, and wraps.
-    newest: u16,
+    pub newest: u16,
     /// The newest requests, each in the place of its id, with their exchanges; [`ANSWERED`] after a reply.
     unanswered: [(u16, u8); KEPT],
     /// A connection was there before.
@@ -53,20 +52,8 @@ impl Transactions {
         Some(len.saturating_add(PREFIX_LEN))
     }
 
-    /// What a frame is that [`probe`] has found; `None` if it answers no request.
-    pub(crate) fn heard<'i>(&mut self, pending: &PendingReplies<'i>, frame: &[u8]) -> Option<Heard<'i>> {
-        let (&[t1, t0, ..], body) = frame.split_first_chunk::<PREFIX_LEN>()?;
-        let id = u16::from_be_bytes([t1, t0]);
-        if id != self.newest || pending.flight.is_none() {
-            return self.take(id).map(|exchange| Heard::Late { exchange, is_pending: false });
-        }
-        let is_good = pending.expected()?.judge(body)?;
-        self.take(id);
-        if is_good { Some(Heard::Reply(pending.asked()?.reply.as_ref())) } else { Some(Heard::Refusal(None)) }
-    }
-
     /// The exchange of a request without a reply; it has one now.
-    fn take(&mut self, id: u16) -> Option<u8> {
+    pub(crate) fn take(&mut self, id: u16) -> Option<u8> {
         let (_, exchange) = self.unanswered.get_mut(slot_of(id)).filter(|(of, _)| *of == id)?;
         Some(core::mem::replace(exchange, ANSWERED)).filter(|exchange| *exchange != ANSWERED)
     }

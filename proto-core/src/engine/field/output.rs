@@ -5,7 +5,8 @@
 //! per call. Does not know when a frame is due.
 
 use super::bindings::{Outputs, values};
-use super::port::{Codec, FieldPort, fields_before};
+use super::codec::Codec;
+use super::port::{FieldPort, fields_before};
 use super::sender::{DIGEST_SEED, digest};
 use crate::engine::counters::{add, bump};
 use crate::image::Image;

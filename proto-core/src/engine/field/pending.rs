@@ -4,12 +4,14 @@
 //! part in it. Applies nothing.
 
 use super::bindings::InputBind;
-use super::device::{DeviceFormat, better, elements, probe};
 use super::exchanges::{Asks, ExchangeItem, InputFormat, OtherFormat};
+use super::format::{DeviceFormat, better, elements, probe};
 use super::line::{Flight, OwnRequest};
+use super::modbus_tcp::Transactions;
 use super::turns::Row;
 use crate::device::Probe;
-use crate::modbus::rtu::{self, Expected, REFUSAL_LEN};
+use crate::modbus::adu::PREFIX_LEN;
+use crate::modbus::rtu::{self, Expected, MAX_ADU, REFUSAL_LEN};
 use crate::time::Instant;
 
 /// What a received frame is.
@@ -120,6 +122,14 @@ impl<'i> PendingReplies<'i> {
         self.answers().chain(self.unasked().map(|(format, ..)| format)).chain(late)
     }
 
+    /// About how many steps it takes to see that bytes are none of the frames that may come.
+    pub(crate) fn effort(&self) -> usize {
+        let effort = |format: &DeviceFormat| {
+            format.layout.lengths().1.saturating_add(usize::from(format.bindings.len))
+        };
+        self.all().map(effort).fold(MAX_ADU, usize::saturating_add)
+    }
+
     /// What a frame of a line is that [`Self::probe`] has found.
     pub(crate) fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
         let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
@@ -147,6 +157,19 @@ impl<'i> PendingReplies<'i> {
             let (format, slot, nth) = self.unasked().find(|(format, ..)| is(format))?;
             Some(Heard::Unasked(format, slot, nth))
         })
+    }
+
+    /// What a frame of Modbus TCP is that [`modbus_tcp::probe`](super::modbus_tcp::probe) has found; `None` if it answers
+    /// no request.
+    pub(crate) fn heard_on_tcp(&self, all: &mut Transactions, frame: &[u8]) -> Option<Heard<'i>> {
+        let (&[t1, t0, ..], body) = frame.split_first_chunk::<PREFIX_LEN>()?;
+        let id = u16::from_be_bytes([t1, t0]);
+        if id != all.newest || self.flight.is_none() {
+            return all.take(id).map(|exchange| Heard::Late { exchange, is_pending: false });
+        }
+        let is_good = self.expected()?.judge(body)?;
+        all.take(id);
+        if is_good { Some(Heard::Reply(self.asked()?.reply.as_ref())) } else { Some(Heard::Refusal(None)) }
     }
 
     /// An answer, unless it may be a refusal of another request or its pending answer; else a late reply. Frames of a

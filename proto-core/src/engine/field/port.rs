@@ -4,7 +4,7 @@
 //! how values reach the controller.
 
 use super::bindings::{InputBind, forget_commands};
-use super::device::DeviceCodec;
+use super::codec::{Codec, DeviceCodec};
 use super::frames::{Accepted, FrameContext};
 use super::line_timing::LineTiming;
 use super::sender::Sender;
@@ -17,23 +17,10 @@ use crate::engine::link::outcome::Outcome;
 use crate::engine::rejection::{LastRejection, Rejection};
 use crate::engine::tap::{Tap, TapDirection, TapPlace, TapVerdict, Tapped};
 use crate::engine::values::store::Store;
-use crate::recipe::Deframer;
-use crate::recipe::StreamLayout;
 use crate::recipe::model::Mode;
 use crate::recipe::{CanLayout, CanReject};
 use crate::time::{Duration, Instant};
 use crate::wire::can::{CanFrame, CanId};
-
-/// The layouts of the port's recipe.
-// With a tag of its own: to find it in the values of a layout takes several instructions, each time.
-#[derive(Debug, Clone)]
-#[repr(u8)]
-#[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
-pub(crate) enum Codec {
-    Stream { input: Option<StreamLayout>, output: Option<StreamLayout>, deframer: Deframer },
-    Can { input: Option<CanLayout>, output: Option<CanLayout> },
-    Device(DeviceCodec),
-}
 
 #[derive(Debug, Clone)]
 pub(crate) struct FieldPort {

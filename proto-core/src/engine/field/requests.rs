@@ -4,13 +4,13 @@
 //! stale. The request of an event was made when it happened.
 
 use super::bindings::{OutputBind, Outputs};
-use super::device::DeviceCodec;
-use super::events::{Event, Outcome};
+use super::codec::DeviceCodec;
+use super::event::{Event, Outcome};
 use super::exchanges::{Asks, ExchangeItem, Piece};
 use super::line::{ExchangeTable, Failure, Line};
+use super::outgoing::Outgoing;
 use super::sender::{DIGEST_SEED, Sender, digest};
 use super::turns::Cause;
-use super::whole::Outgoing;
 use crate::config::OutputBinding;
 use crate::engine::counters::{PortCounters, bump};
 use crate::engine::io::ReplyCode;

@@ -5,13 +5,14 @@
 //! that a master writes is kept, and read back as it was written.
 
 use super::bindings::{InputBind, Outputs};
-use super::device::DeviceCodec;
+use super::codec::{Codec, DeviceCodec, Reader};
 use super::exchanges::{Asks, ExchangeItem, InputFormat, Piece, View};
 use super::frames::{Accepted, FrameContext};
-use super::port::{Codec, FieldPort, came, keep};
+use super::outgoing::Outgoing;
+use super::port::{FieldPort, came, keep};
 use super::requests::may_send;
 use super::sender::Sender;
-use super::whole::{Outgoing, Reader, TextBind};
+use super::texts::TextBind;
 use crate::engine::counters::bump;
 use crate::engine::link::command::CommandLink;
 use crate::engine::rejection::Rejection;

@@ -23,7 +23,7 @@
 //! heard, or was not heard for its `absent` time. It is asked once, and again only when the peer has started: it said so,
 //! or it was away for its `absent` time.
 
-use super::line::PeerState;
+use super::peer_counters::PeerCounters;
 use crate::modbus::rtu::Expected;
 use crate::schedule::{Grid, Presence};
 use crate::time::{Duration, Instant};
@@ -145,6 +145,22 @@ pub(crate) struct Turn {
     nevertheless: Instant,
     missed: u32,
     absent: Duration,
+}
+
+/// One peer of a line.
+#[derive(Debug, Clone)]
+pub(crate) struct PeerState {
+    /// Address of the slave, or number of the device.
+    pub number: u8,
+    pub counters: PeerCounters,
+    pub turn: Turn,
+}
+
+impl PeerState {
+    /// Whether it did not answer when it was last asked.
+    pub(crate) fn is_down(&self) -> bool {
+        self.turn.presence() == Presence::Down
+    }
 }
 
 /// Why a row was taken.

@@ -1,7 +1,6 @@
 //! Builds an engine from a configuration.
 
 use core::net::{IpAddr, Ipv4Addr, SocketAddr};
-
 use heapless::Vec;
 
 use super::codecs::{can_codec, index_of, stream_codec, stream_layout};
@@ -15,9 +14,9 @@ use crate::engine::build_error::{BuildError, one_too_many};
 use crate::engine::counters::PortCounters;
 use crate::engine::dispatch::EngineView;
 use crate::engine::field::bindings::{InputBind, InputTo, OutputBind, Sendable};
-use crate::engine::field::device::DeviceCodec;
+use crate::engine::field::codec::{Codec, DeviceCodec};
 use crate::engine::field::line_timing::LineTiming;
-use crate::engine::field::port::{Codec, FieldPort};
+use crate::engine::field::port::FieldPort;
 use crate::engine::field::rules::{scale_word, words_of};
 use crate::engine::field::sender::Sender;
 use crate::engine::io::{BusState, LinkId, LinkKind, PortId, ReplyCode, Transport};
@@ -27,8 +26,7 @@ use crate::engine::link::device::DeviceLink;
 use crate::engine::link::modbus::{MAX_POLL_BLOCKS, ModbusLink};
 use crate::engine::link::recipe::{Uplink, UplinkSetup};
 use crate::engine::link::state::StateLink;
-use crate::engine::values::bits::MAX_SHARES;
-use crate::engine::values::bits::SafeBytes;
+use crate::engine::values::bits::{MAX_SHARES, SafeBytes};
 use crate::engine::values::counts::MAX_COUNTS;
 use crate::engine::values::outbox::EdgeQueue;
 use crate::engine::values::store::{InputFrame, MAX_INPUT_FRAMES};

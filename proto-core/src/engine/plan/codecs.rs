@@ -3,7 +3,7 @@
 
 use crate::config::{CanFramePart, ConfigView, FieldSpec, Recipe, StreamPart};
 use crate::engine::build_error::BuildError;
-use crate::engine::field::port::Codec;
+use crate::engine::field::codec::Codec;
 use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, Deframer, StreamLayout};
 use crate::sysvar::Direction;
