@@ -78,10 +78,12 @@ impl EngineView<'_> {
         let mut view = self.exchanges.view();
         let until = port.line().and_then(|line| {
             let flight = line.flight()?;
-            let item = view.of(line).0.get(usize::from(flight.exchange))?;
+            let (items, table) = view.of(line);
+            let nth = usize::from(flight.exchange);
+            let (item, row) = (items.get(nth)?, table.rows.get(nth)?);
             Some(match item.event {
                 Event::Sent { until, .. } if flight.cause == Cause::Event => until,
-                _ => now + item.times.timeout.max(PATIENCE),
+                _ => now + row.timeout().max(PATIENCE),
             })
         });
         let Some(link) = self.device_link(LinkId::of_port(id)) else { return false };

@@ -25,7 +25,7 @@ use crate::engine::values::store::Store;
 use crate::image::Image;
 use crate::sysvar::Direction;
 use crate::time::Instant;
-use crate::wire::can::{CanFrame, CanId};
+use crate::wire::can::{CanFrame, CanId, CanKey};
 
 impl DeviceCodec {
     /// The frames of a recipe, whose bindings will begin at these places.
@@ -76,7 +76,7 @@ impl DeviceCodec {
                 let id = ids.get(usize::from(frame.nth)).map_or(CanId::Standard(0), |frame| frame.id);
                 codec
                     .formats
-                    .push(DeviceFormat { layout, id, bindings })
+                    .push(DeviceFormat { layout, key: CanKey::of(id), bindings })
                     .map_err(|_| one_too_many(Counted::DeviceFrames, MAX_DEVICE_FRAMES))?;
                 if part == Direction::Input {
                     codec.inputs = codec.inputs.saturating_add(1);
@@ -327,7 +327,7 @@ impl FieldPort {
         let frame = out.get(..len).unwrap_or(&[]);
         let downward = match device.reader {
             Some(_) => Downward::Bytes(len),
-            None => Downward::Can(CanFrame::cut(format.id, frame)),
+            None => Downward::Can(CanFrame::cut(format.key.id(), frame)),
         };
         let is_last = nth.saturating_add(1) >= formats.len();
         self.counters.sent(len);

@@ -11,7 +11,7 @@ use super::events::{Events, Sources};
 use super::exchanges::{Asks, ExchangeItem, OtherFormat, View};
 use super::format::{DeviceFormat, elements, judge_can};
 use super::frames::{Accepted, FrameContext};
-use super::line::{ExchangeTable, Flight, Line, Over, Phase, Times};
+use super::line::{ExchangeTable, Flight, Line, Over, Phase};
 use super::modbus_tcp;
 use super::output::Downward;
 use super::pending::{Heard, PendingReplies};
@@ -27,7 +27,7 @@ use crate::engine::tap::Tap;
 use crate::engine::values::store::Store;
 use crate::image::{GroupId, Image};
 use crate::time::Instant;
-use crate::wire::can::{CanFrame, CanId};
+use crate::wire::can::{CanFrame, CanId, CanKey};
 
 impl FieldPort {
     /// The line of the exchanges, if the recipe has any.
@@ -154,7 +154,7 @@ impl FieldPort {
                 learn_echo(line, &mut table, true, now);
                 continue;
             }
-            let (flight, times) = (pending.flight, pending.asked().map(|item| item.times));
+            let flight = pending.flight;
             let answer = Answer::of(frame, pending.expected().is_some(), is_tcp);
             let before = accepted.frames;
             let taken = match heard {
@@ -164,7 +164,7 @@ impl FieldPort {
                 Err(why) => Taken::nothing(frames.rejected(why)),
             };
             let verdict = taken.verdict;
-            if heed(line, items, &mut table, (bindings, frames.counters), taken, (flight, times), now) {
+            if heed(line, items, &mut table, (bindings, frames.counters), taken, flight, now) {
                 self.sender.sent();
             }
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
@@ -231,7 +231,7 @@ impl FieldPort {
         };
         let is = |format: &DeviceFormat| {
             let fields = elements(format.bindings.of(bindings));
-            format.id == frame.id()
+            format.key == frame.key()
                 && matches!(format.layout.probe_whole(fields, frame.data()), Probe::Frame(_))
         };
         let (answer, code) = match pending.answer(is) {
@@ -241,7 +241,6 @@ impl FieldPort {
                 None => (None, 0),
             },
         };
-        let times = pending.asked().map(|item| item.times);
         let of_reply = Answer { data: frame.data(), code, is_modbus: false, is_tcp: false };
         let taken = match pending.classify(answer, is, |_| false) {
             Some(heard) => take_heard(&mut frames, texts, heard, (flight, frame.data(), of_reply), accepted),
@@ -264,7 +263,7 @@ impl FieldPort {
             }
         };
         let verdict = taken.verdict;
-        heed(line, items, &mut table, (bindings, frames.counters), taken, (flight, times), now);
+        heed(line, items, &mut table, (bindings, frames.counters), taken, flight, now);
         verdict
     }
 
@@ -308,7 +307,7 @@ impl FieldPort {
             return CanFrame::remote(id, len.into()).map(Downward::Can);
         }
         let frame = out.get(..len).unwrap_or(&[]);
-        let id = item.request.as_ref()?.id;
+        let id = item.request.as_ref()?.key.id();
         Some(Downward::Can(CanFrame::cut(id, frame)))
     }
 
@@ -317,10 +316,9 @@ impl FieldPort {
         let (timing, is_on_can) = (self.line, self.is_on_can());
         let Some(line) = self.line_mut() else { return };
         let (items, mut table) = view.of(line);
-        let times = |nth: u8| items.get(usize::from(nth)).map(|item| item.times);
         let flight = line.flight();
         // A bus is free for others while a reply is pending.
-        let is_pending = line.sent(times, &timing, now);
+        let is_pending = line.sent(&table, &timing, now);
         if let Some(flight) = flight.filter(|_| !is_pending) {
             // Nobody says whether it was heard. What follows it is sent behind it.
             let nth = usize::from(flight.exchange);
@@ -342,8 +340,7 @@ impl FieldPort {
         let (items, mut table) = view.of(line);
         Events { items, table: &mut table, line, now }.expire();
         let Some(failure) = line.failure(&timing, now) else { return };
-        let Some(times) = items.get(usize::from(failure.0.exchange)).map(|item| item.times) else { return };
-        let over = line.failed(&mut table, failure, times, now);
+        let over = line.failed(&mut table, failure, now);
         let (nth, is_event) = (usize::from(failure.0.exchange), failure.0.cause == Cause::Event);
         let ended = match over {
             Over::Repeated => None,
@@ -542,26 +539,26 @@ fn heed(
     table: &mut ExchangeTable<'_>,
     (bindings, counters): (&[InputBind], &mut PortCounters),
     taken: Taken<'_>,
-    (flight, times): (Option<Flight>, Option<Times>),
+    flight: Option<Flight>,
     now: Instant,
 ) -> bool {
     if let Some(told) = taken.told.filter(|_| taken.verdict.is_ok()) {
         look_for_restart(line, items, table, bindings, told, now);
     }
-    match (taken.sign, flight, times) {
-        (Sign::Pending, Some(flight), Some(times)) => goes_on(line, items, table, (flight, times), now),
-        (Sign::Answer(ended, code), Some(flight), Some(times)) => {
+    match (taken.sign, flight) {
+        (Sign::Pending, Some(flight)) => goes_on(line, items, table, flight, now),
+        (Sign::Answer(ended, code), Some(flight)) => {
             // Of a repetition, two copies may be the replies to both requests.
             let is_sure = !flight.is_repetition() && !is_outstanding(table, flight, now);
             if is_sure && (flight.may_be_echo || line.echo.is_some()) {
                 learn_echo(line, table, flight.may_be_echo, now);
             }
             let was_waiting = matches!(line.phase, Phase::Waiting(_));
-            answered(line, items, table, counters, (flight, times), (ended, code), now);
+            answered(line, items, table, counters, flight, (ended, code), now);
             return was_waiting;
         }
-        (Sign::ReplyOrEcho, ..) => line.heard_reply_or_echo(),
-        (sign, ..) => signs(line, items, table, sign, now),
+        (Sign::ReplyOrEcho, _) => line.heard_reply_or_echo(),
+        (sign, _) => signs(line, items, table, sign, now),
     }
     false
 }
@@ -579,8 +576,8 @@ const fn refused_with(code: u16, is_modbus: bool) -> Ended {
 /// The peer whose CANopen node says that it has booted: its object dictionary is asked with SDO in one of the exchanges.
 fn booted_peer(items: &[ExchangeItem], table: &ExchangeTable<'_>, frame: &CanFrame) -> Option<u8> {
     let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (frame.id(), frame.data()) else { return None };
-    let sdo = CanId::Standard(id.wrapping_sub(0x100));
-    let is_of_node = |item: &ExchangeItem| item.request.as_ref().is_some_and(|request| request.id == sdo);
+    let sdo = CanKey::of(CanId::Standard(id.wrapping_sub(0x100)));
+    let is_of_node = |item: &ExchangeItem| item.request.as_ref().is_some_and(|request| request.key == sdo);
     let nth = items.iter().position(is_of_node)?;
     table.rows.get(nth).map(|row| row.peer)
 }
@@ -590,7 +587,7 @@ fn sdo_abort(pending: &PendingReplies<'_>, frame: &CanFrame) -> Option<u16> {
     let multiplexer = pending.flight?.sdo?;
     let reply = pending.asked()?.reply.as_ref()?;
     let &[0x80, a, b, c, low, high, _, _] = frame.data().first_chunk::<8>()? else { return None };
-    (frame.id() == reply.format.id && [a, b, c] == multiplexer).then_some(u16::from_le_bytes([low, high]))
+    (frame.key() == reply.format.key && [a, b, c] == multiplexer).then_some(u16::from_le_bytes([low, high]))
 }
 
 /// Whether a reply to an earlier request of the same exchange may still come.
@@ -620,7 +617,7 @@ fn answered(
     items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
     counters: &mut PortCounters,
-    (flight, times): (Flight, Times),
+    flight: Flight,
     (ended, code): (Ended, u16),
     now: Instant,
 ) {
@@ -636,7 +633,7 @@ fn answered(
             bump(&mut peer.counters.replies);
         }
     }
-    let (ended, news) = line.answered(table, flight, ended, times, now);
+    let (ended, news) = line.answered(table, flight, ended, now);
     let nth = usize::from(flight.exchange);
     let mut events = Events { items, table, line, now };
     events.note(nth, news);
@@ -648,10 +645,10 @@ fn goes_on(
     line: &mut Line,
     items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
-    (flight, times): (Flight, Times),
+    flight: Flight,
     now: Instant,
 ) {
-    line.heard_pending(table, times.timeout, now);
+    line.heard_pending(table, now);
     let nth = usize::from(flight.exchange);
     let Some(which) = table.rows.get(nth).map(|row| row.peer) else { return };
     let news = line.turns(table, |turns| turns.heard(which, Some(nth), now));

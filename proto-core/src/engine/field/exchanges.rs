@@ -3,11 +3,13 @@
 //! In: the exchanges of a configuration. Out: for each port with exchanges a [`Line`], and the frames
 //! that it sends and takes. One list for all ports, so that a port without exchanges takes no room.
 
+use core::num::NonZero;
+
 use heapless::VecView;
 
 use super::event::{Event, ReportedOutcome, Trigger};
 use super::format::DeviceFormat;
-use super::line::{ExchangeTable, Line, Times};
+use super::line::{ExchangeTable, Line};
 use super::turns::{PeerState, Row};
 use crate::config::{FieldSpec, OutcomeTo, Restarted, Span};
 use crate::modbus::rtu::{Operation, Table};
@@ -44,7 +46,6 @@ pub(crate) struct ExchangeItem {
     pub refusal: Option<OtherFormat>,
     /// What in the reply tells that the peer has restarted.
     pub restart: Option<RestartSign>,
-    pub times: Times,
     /// It is asked when a value of the request changes.
     pub on_change: bool,
     /// The bit whose rise asks it.
@@ -61,7 +62,7 @@ pub(crate) struct ExchangeItem {
     pub outcome: OutcomeTo,
     pub is_news: bool,
     /// The newest request, to tell a change.
-    pub digest: Option<u64>,
+    pub digest: Option<NonZero<u64>>,
     /// It was to be asked, and a value of it was unknown or stale.
     pub is_owed: bool,
     /// Where a block that a master writes is kept, so that the master can read it; or the request of an event.

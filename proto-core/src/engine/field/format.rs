@@ -7,14 +7,14 @@ use super::bindings::InputBind;
 use crate::config::Span;
 use crate::device::{Element, FrameLayout, Probe};
 use crate::engine::rejection::Rejection;
-use crate::wire::can::{CanFrame, CanId};
+use crate::wire::can::{CanFrame, CanKey};
 
 /// One frame of the device.
 #[derive(Debug, Clone)]
 pub(crate) struct DeviceFormat {
     pub layout: FrameLayout,
     /// Its id on a CAN bus.
-    pub id: CanId,
+    pub key: CanKey,
     /// Its range of the bindings of its direction, which have its elements.
     pub bindings: Span,
 }
@@ -77,7 +77,7 @@ pub(crate) fn judge_can<'f, T>(
     frame: &CanFrame,
 ) -> Result<(T, &'f DeviceFormat), Rejection> {
     let mut why = Rejection::ForeignId;
-    for (what, format) in formats.filter(|(_, format)| format.id == frame.id()) {
+    for (what, format) in formats.filter(|(_, format)| format.key == frame.key()) {
         let fields = elements(format.bindings.of(bindings));
         let probe = format.layout.probe_whole(fields, frame.data());
         why = match (probe, why) {

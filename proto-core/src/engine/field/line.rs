@@ -81,17 +81,6 @@ pub(crate) enum Over {
     Unconfirmed,
 }
 
-/// The times of one exchange.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Times {
-    pub timeout: Duration,
-    pub pause: Duration,
-    /// Repetitions of a state, and of an event.
-    pub retries: [u8; 2],
-    /// Whether it has a reply.
-    pub is_answered: bool,
-}
-
 /// The exchanges of one port.
 #[derive(Debug, Clone)]
 pub(crate) struct Line {
@@ -298,23 +287,18 @@ impl Line {
     }
 
     /// It has left. Returns whether the line now waits for the reply.
-    pub(crate) fn sent(
-        &mut self,
-        times: impl FnOnce(u8) -> Option<Times>,
-        line: &LineTiming,
-        now: Instant,
-    ) -> bool {
+    pub(crate) fn sent(&mut self, table: &ExchangeTable<'_>, line: &LineTiming, now: Instant) -> bool {
         let Phase::Sending(flight) = self.phase else { return false };
         self.sent = now;
-        let times = times(flight.exchange);
-        let is_answered = times.is_some_and(|times| times.is_answered);
-        let until = |time: fn(&Times) -> Duration| times.as_ref().map_or(now, |times| now + time(times));
+        let row = table.rows.get(usize::from(flight.exchange));
+        let is_answered = row.is_some_and(Row::is_answered);
+        let until = |time: fn(&Row) -> Duration| row.map_or(now, |row| now + time(row));
         self.phase = if is_answered {
-            let latest = until(|times| times.timeout.saturating_mul(LONGEST_PENDING));
-            Phase::Waiting(Flight { until: until(|times| times.timeout), latest, ..flight })
+            let latest = until(|row| row.timeout().saturating_mul(LONGEST_PENDING));
+            Phase::Waiting(Flight { until: until(Row::timeout), latest, ..flight })
         } else {
             // Own bytes are not heard: the silence behind them is kept here.
-            resting(until(|times| times.pause).max(now + line.turnaround), now)
+            resting(until(Row::pause).max(now + line.turnaround), now)
         };
         self.look_at = now;
         is_answered
@@ -336,9 +320,10 @@ impl Line {
     }
 
     /// The peer is at it: its answer is pending anew, as if the request had left now. Writes that stop do not wait for it.
-    pub(crate) fn heard_pending(&mut self, table: &ExchangeTable<'_>, timeout: Duration, now: Instant) {
+    pub(crate) fn heard_pending(&mut self, table: &ExchangeTable<'_>, now: Instant) {
         if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
             (flight.is_pending, flight.is_wrong) = (true, false);
+            let timeout = table.rows.get(usize::from(flight.exchange)).map_or(Duration::ZERO, Row::timeout);
             flight.until = (now + timeout).min(flight.latest);
         }
         if matches!(self.phase, Phase::Waiting(_)) {
@@ -375,7 +360,6 @@ impl Line {
         table: &mut ExchangeTable<'_>,
         flight: Flight,
         ended: Ended,
-        times: Times,
         now: Instant,
     ) -> (Ended, News) {
         let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
@@ -389,11 +373,12 @@ impl Line {
         }
         let news =
             self.turns(table, |turns| turns.answered(usize::from(flight.exchange), flight.cause, ended, now));
-        self.rest(times.pause, now);
+        self.rest(table, flight, now);
         (ended, news)
     }
 
-    fn rest(&mut self, pause: Duration, now: Instant) {
+    fn rest(&mut self, table: &mut ExchangeTable<'_>, flight: Flight, now: Instant) {
+        let pause = table.row_of(flight).map_or(Duration::ZERO, |row| row.pause());
         self.phase = resting(now + pause, now);
         self.look_at = now;
         self.echo = None;
@@ -416,12 +401,12 @@ impl Line {
         &mut self,
         table: &mut ExchangeTable<'_>,
         (flight, failure): (Flight, Failure),
-        times: Times,
         now: Instant,
     ) -> Over {
         // A write that stops does not wait for repetitions.
         let yields = table.rows.iter().any(|row| row.stop_at().is_some_and(|at| at <= now));
         let sent = self.sent;
+        let retries = table.row_of(flight).map_or(0, |row| row.retries(flight.cause));
         let Some(peer) = table.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
         let counters = &mut peer.counters;
         let counter = match failure {
@@ -437,13 +422,9 @@ impl Line {
             leave_outstanding(table, Flight { unanswered, ..flight }, count, sent, now);
             let nth = usize::from(flight.exchange);
             self.turns(table, |turns| turns.answered(nth, flight.cause, Ended::Unconfirmed, now));
-            self.rest(times.pause, now);
+            self.rest(table, flight, now);
             return Over::Unconfirmed;
         }
-        let retries = match flight.cause {
-            Cause::State(_) => times.retries[0],
-            Cause::Start | Cause::Event => times.retries[1],
-        };
         let unanswered =
             if failure == Failure::Checksum { flight.unanswered } else { flight.unanswered.min(sent) };
         // The peer has the request of which it said that it is at it.
@@ -461,7 +442,7 @@ impl Line {
             self.has_echo = None;
         }
         let was_wrong = flight.was_wrong || failure == Failure::Checksum;
-        Over::GivenUp(self.give_up(table, Flight { unanswered, was_wrong, ..flight }, failure, times, now))
+        Over::GivenUp(self.give_up(table, Flight { unanswered, was_wrong, ..flight }, failure, now))
     }
 
     /// The request has failed and is not repeated.
@@ -470,7 +451,6 @@ impl Line {
         table: &mut ExchangeTable<'_>,
         flight: Flight,
         failure: Failure,
-        times: Times,
         now: Instant,
     ) -> News {
         let sent = self.sent;
@@ -481,7 +461,7 @@ impl Line {
             // It said something, and nobody knows what.
             _ => turns.answered(nth, flight.cause, Ended::Unclear, now),
         });
-        self.rest(times.pause, now);
+        self.rest(table, flight, now);
         news
     }
 

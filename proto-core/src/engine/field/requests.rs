@@ -3,6 +3,8 @@
 //! In: the image, the exchanges of a port, its line. Out: a request, unless a value of it is unknown or
 //! stale. The request of an event was made when it happened.
 
+use core::num::NonZero;
+
 use super::bindings::{OutputBind, Outputs};
 use super::codec::DeviceCodec;
 use super::event::{Event, Outcome};
@@ -75,7 +77,7 @@ impl Maker<'_> {
                 bump(&mut peer.counters.unprepared);
                 if flight.is_repetition() {
                     bump(&mut counters.unanswered);
-                    line.give_up(table, flight, Failure::Timeout, item.times, now);
+                    line.give_up(table, flight, Failure::Timeout, now);
                 } else {
                     item.is_owed |= matches!(flight.cause, Cause::State(Some(_)));
                     line.turns(table, |turns| turns.not_sent(nth, flight.cause, now));
@@ -86,7 +88,7 @@ impl Maker<'_> {
             if line.transactions.is_none() && !flight.may_repeat(request) {
                 // A reply to the old value must not confirm the new one. The exchange is asked again when none can come.
                 bump(&mut counters.unanswered);
-                line.give_up(table, flight, Failure::Timeout, item.times, now);
+                line.give_up(table, flight, Failure::Timeout, now);
                 continue;
             }
             bump(&mut peer.counters.requests);
@@ -128,9 +130,9 @@ impl Maker<'_> {
     }
 
     /// What a request says now, but for a counter of frames: that changes with each.
-    fn content(&self, item: &ExchangeItem, out: &mut [u8]) -> Option<u64> {
+    fn content(&self, item: &ExchangeItem, out: &mut [u8]) -> Option<NonZero<u64>> {
         let len = self.make_counted(item, 0, out).ok()?;
-        Some(digest(DIGEST_SEED, out.get(..len).unwrap_or(&[])))
+        Some(NonZero::<u64>::MIN | digest(DIGEST_SEED, out.get(..len).unwrap_or(&[])))
     }
 
     fn fields(&self, item: &ExchangeItem) -> &[OutputBind] {
@@ -187,7 +189,7 @@ fn copy(item: &ExchangeItem, kept: &[Piece], len: usize, out: &mut [u8]) {
 
 /// Index and subindex of an SDO request, with its command in front.
 fn sdo_of(item: &ExchangeItem, request: &[u8]) -> Option<[u8; 3]> {
-    let (request_id, reply_id) = (item.request.as_ref()?.id, item.reply.as_ref()?.format.id);
+    let (request_id, reply_id) = (item.request.as_ref()?.key.id(), item.reply.as_ref()?.format.key.id());
     let (CanId::Standard(request_id @ 0x601..=0x67F), CanId::Standard(reply_id)) = (request_id, reply_id)
     else {
         return None;

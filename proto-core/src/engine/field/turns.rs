@@ -51,15 +51,17 @@ pub(crate) struct Row {
     kind: RowKind,
     grid: Option<Grid>,
     /// A change, a write that stops, or a start of one that is also written again: wanted until it is answered.
-    requested: Option<Instant>,
+    /// [`Instant::NEVER`] if it is not, as with the other instants here.
+    requested: Instant,
     /// What is asked at the start, if that is all it is asked for.
     start: Start,
+    start_at: Instant,
     opens: Opens,
     /// An event that is ready to be sent, since this instant.
-    event: Option<Instant>,
+    event: Instant,
     /// When it was taken last.
     taken: Instant,
-    times: RowTimes,
+    times: Times,
     /// The rows of the line, as bits, whose answers could be taken for its reply.
     pub alike: u64,
     /// How many replies to earlier transmissions may still come.
@@ -90,26 +92,29 @@ pub(crate) struct RowKind {
     pub is_state: bool,
     /// It stops its peer.
     pub stops: bool,
+    /// Repetitions of a state, and of an event.
+    pub retries: [u8; 2],
 }
 
 /// The times of a row.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct RowTimes {
-    pub every: Option<Duration>,
+pub(crate) struct Times {
     /// Time on the line if no answer comes.
     pub cost: Duration,
     pub timeout: Duration,
     /// How long after its request a reply may come.
     pub late: Duration,
+    /// The rest of the line behind it.
+    pub pause: Duration,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Start {
     /// It was carried out, or nobody knows; it is not asked.
     Over,
-    Wanted(Instant),
-    /// It was sent and nothing was heard since. From this instant on the peer has been away long enough.
-    Unheard(Instant),
+    Wanted,
+    /// It was sent and nothing was heard since. At its instant the peer has been away long enough.
+    Unheard,
 }
 
 /// Whether the other exchanges of the peer wait, because this one comes first at its start.
@@ -138,7 +143,8 @@ pub(crate) struct Turn {
     /// It was heard since the line began.
     was_heard: bool,
     /// Since when its requests are not answered, and until when that was seen.
-    failing: Option<(Instant, Instant)>,
+    failing_since: Instant,
+    failing_until: Instant,
     failures: u8,
     /// Asked in a gap from here on, and in any case at the second instant.
     not_before: Instant,
@@ -222,7 +228,8 @@ impl Turn {
         Self {
             presence: Presence::Unknown,
             was_heard: false,
-            failing: None,
+            failing_since: Instant::NEVER,
+            failing_until: Instant::ZERO,
             failures: 0,
             not_before: Instant::ZERO,
             nevertheless: Instant::ZERO,
@@ -251,7 +258,8 @@ impl Turn {
 
     /// It was away for its `absent` time.
     fn was_absent(&self) -> bool {
-        self.failing.is_some_and(|(since, until)| until.saturating_since(since) >= self.absent)
+        self.failing_since != Instant::NEVER
+            && self.failing_until.saturating_since(self.failing_since) >= self.absent
     }
 
     /// It has said nothing for that time since the line began: perhaps it does not before it was started.
@@ -261,15 +269,16 @@ impl Turn {
 }
 
 impl Row {
-    pub(crate) fn new(peer: u8, kind: RowKind, times: RowTimes) -> Self {
+    pub(crate) fn new(peer: u8, kind: RowKind, period: Option<Duration>, times: Times) -> Self {
         Self {
             peer,
             kind,
-            grid: times.every.map(|period| Grid::starting_at(Instant::ZERO, period)),
-            requested: None,
+            grid: period.map(|period| Grid::starting_at(Instant::ZERO, period)),
+            requested: Instant::NEVER,
             start: Start::Over,
+            start_at: Instant::NEVER,
             opens: Opens::No,
-            event: None,
+            event: Instant::NEVER,
             taken: Instant::ZERO,
             times,
             alike: 0,
@@ -299,7 +308,27 @@ impl Row {
 
     /// From when on it is to be sent, if it stops its peer and is wanted.
     pub(crate) fn stop_at(&self) -> Option<Instant> {
-        self.requested.filter(|_| self.kind.stops).map(|wanted| wanted.max(self.wait.not_before))
+        (self.kind.stops && self.is_requested()).then(|| self.requested.max(self.wait.not_before))
+    }
+
+    fn is_requested(&self) -> bool {
+        self.requested != Instant::NEVER
+    }
+
+    /// Wants it from now on, if it is not wanted yet.
+    fn request(&mut self, now: Instant) {
+        self.requested = self.requested.min(now);
+    }
+
+    /// Wants it again for the same reason, unless it is wanted for a newer one.
+    fn request_again(&mut self, requested: Option<Instant>) {
+        if !self.is_requested() {
+            self.requested = requested.unwrap_or(Instant::NEVER);
+        }
+    }
+
+    const fn set_start(&mut self, start: Start, at: Instant) {
+        (self.start, self.start_at) = (start, at);
     }
 
     pub(crate) const fn timeout(&self) -> Duration {
@@ -308,6 +337,19 @@ impl Row {
 
     pub(crate) const fn late(&self) -> Duration {
         self.times.late
+    }
+
+    pub(crate) const fn pause(&self) -> Duration {
+        self.times.pause
+    }
+
+    /// How often a request for this reason is repeated.
+    pub(crate) const fn retries(&self, cause: Cause) -> u8 {
+        let [of_state, of_event] = self.kind.retries;
+        match cause {
+            Cause::State(_) => of_state,
+            Cause::Start | Cause::Event => of_event,
+        }
     }
 
     /// Whether a reply to an earlier transmission may still come.
@@ -331,7 +373,7 @@ impl Row {
     /// is not known, and may be answered now.
     fn begin(&mut self, now: Instant) {
         self.start_over(now);
-        (self.event, self.expected) = (None, None);
+        (self.event, self.expected) = (Instant::NEVER, None);
         (self.wait, self.was_answered, self.is_missed) = (Wait::NONE, false, false);
         self.is_unconfirmed = false;
         // Nobody knows how many: they are pending until the end.
@@ -349,22 +391,15 @@ impl Row {
         }
         self.opens = Opens::Yes;
         if self.kind.is_state {
-            self.requested.get_or_insert(now);
+            self.request(now);
         } else {
-            self.start = Start::Wanted(now);
-        }
-    }
-
-    fn start_at(&self) -> Instant {
-        match self.start {
-            Start::Over => Instant::NEVER,
-            Start::Wanted(at) | Start::Unheard(at) => at,
+            self.set_start(Start::Wanted, now);
         }
     }
 
     /// Since when it is wanted beside its period.
     fn requested_at(&self) -> Instant {
-        self.requested.unwrap_or(Instant::NEVER).min(self.start_at())
+        self.requested.min(self.start_at)
     }
 
     /// Since when the row is to be taken, or from when; of one without an event that is ready.
@@ -382,17 +417,17 @@ impl Turns<'_> {
     /// Wants a row until it is answered.
     pub(crate) fn request(&mut self, nth: usize, now: Instant) {
         if let Some(row) = self.rows.get_mut(nth) {
-            if row.requested.is_none() {
+            if !row.is_requested() {
                 row.former = row.outstanding_until;
             }
-            row.requested.get_or_insert(now);
+            row.request(now);
         }
     }
 
     /// The request of an event is ready, or is not sent any more.
     pub(crate) fn set_event(&mut self, nth: usize, event: Option<Instant>) {
         if let Some(row) = self.rows.get_mut(nth) {
-            row.event = event;
+            row.event = event.unwrap_or(Instant::NEVER);
         }
     }
 
@@ -410,30 +445,30 @@ impl Turns<'_> {
             self.failed(nth, cause, now, now);
         }
         for peer in &mut *self.peers {
-            peer.turn.failing.get_or_insert((now, now));
+            if peer.turn.failing_since == Instant::NEVER {
+                (peer.turn.failing_since, peer.turn.failing_until) = (now, now);
+            }
         }
     }
 
     /// The connection is there again: periods begin now, and nobody has to wait.
     pub(crate) fn resume(&mut self, now: Instant) {
         for row in &mut *self.rows {
-            (row.event, row.wait) = (None, Wait::NONE);
+            (row.event, row.wait) = (Instant::NEVER, Wait::NONE);
             if let Some(grid) = &mut row.grid {
                 *grid = Grid::starting_at(now, grid.period());
             }
         }
-        for Turn { presence, failing, not_before, nevertheless, .. } in
-            self.peers.iter_mut().map(|peer| &mut peer.turn)
-        {
-            (*presence, *not_before, *nevertheless) = (Presence::Unknown, Instant::ZERO, Instant::ZERO);
-            *failing = failing.map(|(since, _)| (since, now));
+        for turn in self.peers.iter_mut().map(|peer| &mut peer.turn) {
+            turn.presence = Presence::Unknown;
+            (turn.not_before, turn.nevertheless, turn.failing_until) = (Instant::ZERO, Instant::ZERO, now);
         }
         *self.run = 0;
     }
 
     /// Whether a write that stops this peer is still to be sent.
     pub(crate) fn is_stopping(&self, which: u8) -> bool {
-        self.rows.iter().any(|row| row.peer == which && row.kind.stops && row.requested.is_some())
+        self.rows.iter().any(|row| row.peer == which && row.stop_at().is_some())
     }
 
     /// The row to take now, or when to look again.
@@ -445,10 +480,7 @@ impl Turns<'_> {
         let is_opening = self.rows.iter().any(|row| row.opens == Opens::Yes);
         for (nth, row) in self.rows.iter().enumerate() {
             let Some(peer) = self.peers.get(usize::from(row.peer)).map(|peer| &peer.turn) else { continue };
-            if row.kind.stops
-                && let Some(wanted) = row.requested
-            {
-                let at = wanted.max(row.wait.not_before);
+            if let Some(at) = row.stop_at() {
                 if at > now {
                     look_again = look_again.min(at);
                 } else {
@@ -463,14 +495,12 @@ impl Turns<'_> {
                 continue;
             }
             let free_at = self.free_at(row, now);
-            if let Some(wanted) = row.event {
-                let busy_until = if row.wait.is_busy { row.wait.not_before } else { Instant::ZERO };
-                let at = wanted.max(free_at).max(busy_until);
-                if at > now {
-                    look_again = look_again.min(at);
-                } else {
-                    event.consider((wanted, row.taken), nth);
-                }
+            let busy_until = if row.wait.is_busy { row.wait.not_before } else { Instant::ZERO };
+            let at = row.event.max(free_at).max(busy_until);
+            if at > now {
+                look_again = look_again.min(at);
+            } else {
+                event.consider((row.event, row.taken), nth);
             }
             let wanted = row.wanted();
             let at = wanted.max(free_at).max(row.wait.not_before);
@@ -557,8 +587,8 @@ impl Turns<'_> {
         let turn = self.peers.get(usize::from(row.peer)).map(|peer| &peer.turn);
         let waits = match row.start {
             Start::Over => false,
-            Start::Wanted(_) => turn.is_some_and(|turn| turn.presence != Presence::Up && !turn.is_mute()),
-            Start::Unheard(_) => true,
+            Start::Wanted => turn.is_some_and(|turn| turn.presence != Presence::Up && !turn.is_mute()),
+            Start::Unheard => true,
         };
         waits && self.rows.iter().any(tells)
     }
@@ -567,8 +597,7 @@ impl Turns<'_> {
     pub(crate) fn take(&mut self, nth: usize, now: Instant) -> Cause {
         let Some(row) = self.rows.get_mut(nth) else { return Cause::State(None) };
         row.taken = now;
-        let is_stop = row.kind.stops && row.requested.is_some();
-        if !is_stop && row.event.take().is_some() {
+        if row.stop_at().is_none() && core::mem::replace(&mut row.event, Instant::NEVER) != Instant::NEVER {
             return Cause::Event;
         }
         if row.opens == Opens::Yes {
@@ -576,9 +605,11 @@ impl Turns<'_> {
         }
         let is_due = row.grid.as_ref().is_some_and(|grid| grid.next() <= now);
         let missed = row.grid.as_mut().and_then(|grid| grid.due(now)).unwrap_or(0);
-        let is_start = row.start_at() <= now && row.requested.is_none() && !is_due;
-        row.start = Start::Over;
-        let cause = if is_start { Cause::Start } else { Cause::State(row.requested.take()) };
+        let is_start = row.start_at <= now && !row.is_requested() && !is_due;
+        row.set_start(Start::Over, Instant::NEVER);
+        let requested = core::mem::replace(&mut row.requested, Instant::NEVER);
+        let requested = Some(requested).filter(|at| *at != Instant::NEVER);
+        let cause = if is_start { Cause::Start } else { Cause::State(requested) };
         if let Some(peer) = self.peers.get_mut(usize::from(row.peer)).map(|peer| &mut peer.turn)
             && !peer.is_away()
         {
@@ -593,9 +624,9 @@ impl Turns<'_> {
         let Some(row) = self.rows.get_mut(nth) else { return };
         match cause {
             // Without `opens`: the others need not wait for its values.
-            Cause::Start => row.start = Start::Wanted(now + row.times.timeout),
+            Cause::Start => row.set_start(Start::Wanted, now + row.times.timeout),
             Cause::State(Some(_)) if row.kind.stops => {
-                row.requested.get_or_insert(now);
+                row.request(now);
                 row.wait.not_before = now + row.times.timeout;
             }
             _ => {}
@@ -612,9 +643,9 @@ impl Turns<'_> {
             Ended::Busy | Ended::Unclear => {
                 row.wait.longer(row.times.timeout, now, ended == Ended::Busy);
                 match cause {
-                    Cause::State(requested) => row.requested = row.requested.or(requested),
+                    Cause::State(requested) => row.request_again(requested),
                     // It was not carried out.
-                    Cause::Start if ended == Ended::Busy => row.start = Start::Wanted(now),
+                    Cause::Start if ended == Ended::Busy => row.set_start(Start::Wanted, now),
                     Cause::Start | Cause::Event => {}
                 }
             }
@@ -622,7 +653,7 @@ impl Turns<'_> {
         }
         if row.kind.stops && ended != Ended::Good && ended != Ended::Accepted {
             // A stop is wanted until it is confirmed, whatever a refusal says.
-            row.requested.get_or_insert(now);
+            row.request(now);
             row.wait.not_before = now + row.times.timeout;
         }
         if ended == Ended::Unconfirmed {
@@ -637,12 +668,13 @@ impl Turns<'_> {
         let turn = &mut peer.turn;
         let was_away = turn.is_away();
         let has_started = turn.was_absent();
-        (turn.presence, turn.was_heard, turn.failing, turn.failures) = (Presence::Up, true, None, 0);
+        (turn.presence, turn.was_heard, turn.failures) = (Presence::Up, true, 0);
+        turn.failing_since = Instant::NEVER;
         for row in self.rows.iter_mut().filter(|row| row.peer == which) {
             row.is_missed = false;
             // Its request, or the reply, was lost; nobody knows which.
-            if let Start::Unheard(_) = row.start {
-                row.start = Start::Over;
+            if row.start == Start::Unheard {
+                row.set_start(Start::Over, Instant::NEVER);
             }
             if was_away && let Some(grid) = &mut row.grid {
                 // What went by in the meantime is not missed.
@@ -671,7 +703,7 @@ impl Turns<'_> {
     /// The peer has not answered a request that left first at `sent`.
     pub(crate) fn failed(&mut self, nth: usize, cause: Cause, now: Instant, sent: Instant) -> News {
         let Some(row) = self.rows.get_mut(nth) else { return News::Nothing };
-        let (timeout, which, stops) = (row.times.timeout, row.peer, row.kind.stops);
+        let (timeout, which) = (row.times.timeout, row.peer);
         let Some(peer) = self.peers.get_mut(usize::from(which)).map(|peer| &mut peer.turn) else {
             return News::Nothing;
         };
@@ -680,18 +712,20 @@ impl Turns<'_> {
             row.opens = if cause == Cause::Start { Opens::No } else { Opens::Yes };
         }
         match cause {
-            Cause::State(requested) => row.requested = row.requested.or(requested),
-            Cause::Start => row.start = Start::Unheard(sent + peer.absent),
+            Cause::State(requested) => row.request_again(requested),
+            Cause::Start => row.set_start(Start::Unheard, sent + peer.absent),
             Cause::Event => {}
         }
         row.wait.longer(timeout, now, false);
-        if stops && row.requested.is_some() {
+        if row.stop_at().is_some() {
             // Others have a turn, no more.
             row.wait.not_before = now + timeout;
         }
         row.is_missed = true;
-        let since = peer.failing.map_or(sent, |(since, _)| since);
-        peer.failing = Some((since, now));
+        if peer.failing_since == Instant::NEVER {
+            peer.failing_since = sent;
+        }
+        peer.failing_until = now;
         peer.failures = peer.failures.saturating_add(1);
         let was_away = peer.is_away();
         if !was_away && !self.is_silent(which) {

@@ -13,15 +13,15 @@ use crate::engine::field::bindings::{InputBind, InputTo};
 use crate::engine::field::event::{Event, ReportedOutcome, Trigger};
 use crate::engine::field::exchanges::{Asks, ExchangeItem, InputFormat, OtherFormat, Piece, RestartSign};
 use crate::engine::field::format::DeviceFormat;
-use crate::engine::field::line::{Line, Times};
+use crate::engine::field::line::Line;
 use crate::engine::field::modbus_tcp::Transactions;
 use crate::engine::field::peer_counters::PeerCounters;
-use crate::engine::field::turns::{PeerState, Row, RowKind, RowTimes, Turn};
+use crate::engine::field::turns::{PeerState, Row, RowKind, Times, Turn};
 use crate::modbus::rtu::{BROADCAST, Timing};
 use crate::schedule::Grid;
 use crate::sysvar::Direction;
 use crate::time::{Duration, Instant};
-use crate::wire::can::CanId;
+use crate::wire::can::{CanId, CanKey};
 
 /// Where the next fields are among the bindings of their direction, and the next input frame in the
 /// store.
@@ -78,7 +78,7 @@ impl Formats<'_> {
         let bindings = Span { start: *next, len: frame.elements.len() as u16 };
         *next = next.saturating_add(bindings.len);
         *nth = nth.saturating_add(1);
-        Ok(DeviceFormat { layout: frame.layout, id: of.id(), bindings })
+        Ok(DeviceFormat { layout: frame.layout, key: CanKey::of(of.id()), bindings })
     }
 
     fn input(&mut self, of: FrameOf<'_>) -> Result<InputFormat, BuildError> {
@@ -110,7 +110,7 @@ impl Formats<'_> {
                 .push(bind)
                 .map_err(|_| one_too_many(Counted::UserFields, self.refusals.capacity()))?;
         }
-        Ok(DeviceFormat { layout: frame.layout, id: FrameOf::Spec(spec).id(), bindings })
+        Ok(DeviceFormat { layout: frame.layout, key: CanKey::of(FrameOf::Spec(spec).id()), bindings })
     }
 
     /// The data of Modbus registers or coils that are sent.
@@ -144,12 +144,6 @@ impl Formats<'_> {
             pending: None,
             refusal: None,
             restart: None,
-            times: Times {
-                timeout: exchange.timeout,
-                pause: exchange.pause,
-                retries: [exchange.retries, exchange.event_retries],
-                is_answered: true,
-            },
             on_change: exchange.when.change,
             trigger: exchange.when.rising.map(Trigger::new),
             stops: exchange.stop,
@@ -167,11 +161,6 @@ impl Formats<'_> {
         match exchange.transaction {
             Transaction::Rtu { operation, written, read } => {
                 item.asks = Asks::Rtu { slave: exchange.peer, operation };
-                item.times.is_answered = exchange.peer != BROADCAST;
-                if !item.times.is_answered {
-                    // The slaves carry it out, and nobody says when they have.
-                    item.times.pause = exchange.pause + Timing::TURNAROUND;
-                }
                 item.request = self.data_out(written)?;
                 item.reply = self.data_in(read)?;
             }
@@ -204,7 +193,6 @@ impl Formats<'_> {
                         *to = Some(self.other(spec)?);
                     }
                 }
-                item.times.is_answered = item.reply.is_some();
             }
         }
         let fields = exchange.fields(self.config.frames, Direction::Input).unwrap_or_default();
@@ -295,10 +283,15 @@ impl EngineView<'_> {
                         || exchange.when.change
                         || exchange.when.start),
                 stops: exchange.stop,
+                retries: [exchange.retries, exchange.event_retries],
             };
-            let every = exchange.when.every;
-            let times = RowTimes { every, cost, timeout: exchange.timeout, late: exchange.late() };
-            let mut row = Row::new(peer as u8, kind, times);
+            let pause = match item.asks {
+                // The slaves carry it out, and nobody says when they have.
+                Asks::Rtu { slave: BROADCAST, .. } => exchange.pause + Timing::TURNAROUND,
+                _ => exchange.pause,
+            };
+            let times = Times { cost, timeout: exchange.timeout, late: exchange.late(), pause };
+            let mut row = Row::new(peer as u8, kind, exchange.when.every, times);
             // A transaction id tells all replies apart.
             row.alike = if is_tcp { 0 } else { config.waits_for(recipe, exchange) };
             self.exchanges.rows.push(row).map_err(|_| full())?;
