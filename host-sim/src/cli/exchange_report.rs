@@ -1,6 +1,6 @@
 //! The exchanges of a recipe as `check` draws them: what is asked when, its bytes, and its time.
 
-use proto_core::config::{self, Bus, Exchange, GatewayConfig, Port, Triggers, register_bits};
+use proto_core::config::{self, Exchange, GatewayConfig, Port, Triggers, register_bits};
 use proto_core::device::Carrier;
 use proto_core::engine::{Plan, Source};
 use proto_core::modbus::rtu::{BROADCAST, Operation, Table};
@@ -82,7 +82,7 @@ impl ExchangeReport {
             ExchangeKind::Slave(_) => "block",
             _ => "exchange",
         };
-        let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
+        let is_tcp = port.bus.is_modbus_tcp();
         let budget = config.view().exchange_budget(port, exchange);
         // A slave receives requests and sends replies.
         let (asks, answers) = match named.kind {
@@ -130,7 +130,7 @@ impl ExchangeReport {
             held_back,
             pulse_ms: shortest_pulse(config, port, exchange).map(millis),
             zeroed_bits: zeroed_bits(config, exchange).map(|bits| format!("{bits:#06X}")),
-            may_leave_late: exchange.when.rising.is_some() && matches!(port.bus, Bus::Can { .. }),
+            may_leave_late: exchange.when.rising.is_some() && port.bus.is_can(),
             percent: exchange
                 .when
                 .every

@@ -6,7 +6,7 @@ use super::error::{ConfigErrorKind as Kind, ExchangeError, ExchangeKey as Key, P
 use super::exchange::{Exchange, FrameSpec, Transaction};
 use super::rules::{Check, LONGEST_TRIGGER, MAX_TIME, check_pool, check_time, check_trigger, fail};
 use super::{
-    Bus, ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding, Parts, Port, PortHealth, Recipe, Span,
+    ConfigView, Constants, DeviceFrame, FieldSpec, InputBinding, Parts, Port, PortHealth, Recipe, Span,
     StreamPart, has_values,
 };
 use crate::device::{Carrier, LayoutError};
@@ -237,7 +237,7 @@ impl<'a> ExchangeCheck<'a> {
     /// Whether all ports with this recipe are of Modbus TCP, whose unit ids have no end but that of a byte.
     fn is_only_over_tcp(&self) -> bool {
         let mut own = self.config.ports.iter().filter(|port| port.recipe == self.index).peekable();
-        own.peek().is_some() && own.all(|port| matches!(port.bus, Bus::ModbusTcp { .. }))
+        own.peek().is_some() && own.all(|port| port.bus.is_modbus_tcp())
     }
 
     /// Counts, and that the fields fill them: those that are written, and those that are read.

@@ -45,7 +45,7 @@ impl ConfigView<'_> {
             }
         };
         // A header of 6 bytes in place of a CRC.
-        let framing = if matches!(port.bus, Bus::ModbusTcp { .. }) { 4 } else { 0 };
+        let framing = if port.bus.is_modbus_tcp() { 4 } else { 0 };
         let (request, reply) = (request.saturating_add(framing), reply.saturating_add(framing));
         let [request_id, reply_id] = ids;
         let asks = request_on_line(port, exchange, request, request_id);

@@ -112,8 +112,29 @@ impl Bus {
     pub const MODBUS_TCP: u16 = 502;
 
     /// Whether devices (not the controller) are at the other end.
-    pub fn is_field(&self) -> bool {
-        matches!(self, Self::Rs485(_) | Self::Can { .. } | Self::ModbusTcp { .. })
+    pub const fn is_field(&self) -> bool {
+        match self {
+            Self::Rs485(_) | Self::Can { .. } | Self::ModbusTcp { .. } => true,
+            Self::TcpListen { .. } | Self::UdpListen { .. } => false,
+        }
+    }
+
+    /// Whether frames are CAN frames, and several nodes send whenever the bus is free.
+    pub const fn is_can(&self) -> bool {
+        match self {
+            Self::Can { .. } => true,
+            Self::Rs485(_) | Self::ModbusTcp { .. } | Self::TcpListen { .. } | Self::UdpListen { .. } => {
+                false
+            }
+        }
+    }
+
+    /// Whether it is a connection of the gateway's own, on which transaction ids tell replies apart.
+    pub const fn is_modbus_tcp(&self) -> bool {
+        match self {
+            Self::ModbusTcp { .. } => true,
+            Self::Rs485(_) | Self::Can { .. } | Self::TcpListen { .. } | Self::UdpListen { .. } => false,
+        }
     }
 }
 

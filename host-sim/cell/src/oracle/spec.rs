@@ -291,7 +291,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
         written,
         needed: outputs.iter().flat_map(|frame| &frame.shown).copied().chain(trigger).collect(),
         is_field: port.bus.is_field(),
-        is_can: matches!(port.bus, Bus::Can { .. }),
+        is_can: port.bus.is_can(),
         mode: recipe.mode,
         inputs,
         outputs,

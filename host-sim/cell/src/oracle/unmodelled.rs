@@ -14,7 +14,7 @@ use super::varying::can_be_the_same;
 
 /// Why a configuration cannot be judged, if it cannot.
 pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
-    if config.ports.iter().any(|port| matches!(port.bus, Bus::ModbusTcp { .. })) {
+    if config.ports.iter().any(|port| port.bus.is_modbus_tcp()) {
         return Some("a soak cannot judge ports of Modbus TCP");
     }
     let reason = in_blocks(config).or_else(|| in_exchanges(config)).or_else(|| in_varying_frames(config));

@@ -5,9 +5,7 @@
 //! dead, or with replies that are damaged, cut short, lost, behind noise, or to another question. None
 //! takes three times its timeout for a reply, behind which no master could tell it from one to the next request.
 
-use proto_core::config::{
-    Bus, DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Transaction,
-};
+use proto_core::config::{DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Transaction};
 use proto_core::device::{Carrier, Probe};
 use proto_core::sysvar::Direction;
 use proto_core::time::{Duration, Instant};
@@ -82,7 +80,7 @@ impl Peers {
     /// The devices of a port; `None` if its recipe has no exchanges of frames.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, mut rng: Rng) -> Option<Self> {
         let recipe = config.recipes.get(usize::from(port.recipe))?;
-        let is_on_can = matches!(port.bus, Bus::Can { .. });
+        let is_on_can = port.bus.is_can();
         let mut unasked: Vec<(Option<usize>, Sends)> = Vec::new();
         match &recipe.parts {
             Parts::Stream { input: Some(part), .. } => {

@@ -69,7 +69,7 @@ impl PreparedGateway {
         let engine: Box<GatewayEngine> =
             Box::new(GatewayEngine::new(config).map_err(|error| RunError::new(error.to_string()))?);
         // Modbus TCP ports have links instead.
-        let has_device = |port: &PortConfig| !matches!(port.bus, Bus::ModbusTcp { .. });
+        let has_device = |port: &PortConfig| !port.bus.is_modbus_tcp();
         let field = || config.view().field_ports().map(|(_, port, _)| port).filter(|port| has_device(port));
         if let Some(bind) =
             devices.binds.iter().find(|bind| field().all(|port| port.name != bind.port.as_str()))

@@ -61,7 +61,7 @@ pub(super) fn loads(
     recipes: &[AnyRecipe],
     shared: &[Vec<String>],
 ) -> Result<(Vec<Load>, Vec<Trouble>), String> {
-    let can: Vec<&Port> = config.ports.iter().filter(|port| matches!(port.bus, Bus::Can { .. })).collect();
+    let can: Vec<&Port> = config.ports.iter().filter(|port| port.bus.is_can()).collect();
     let mut groups: Vec<Vec<&Port>> = Vec::new();
     let mut named: Vec<&str> = Vec::new();
     for names in shared {

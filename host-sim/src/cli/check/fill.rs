@@ -83,7 +83,7 @@ fn gateway_port(
             frames.and_then(|recipe| shortest(recipe, part)).filter(|least| *least < shown.bytes);
         Some(shown)
     });
-    let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
+    let is_tcp = port.bus.is_modbus_tcp();
     report::PortReport {
         name: port.name.to_string(),
         bus,

@@ -173,7 +173,7 @@ impl Session {
         let code = match kind {
             ReplyKind::Success | ReplyKind::Value => ReplyCode::Success,
             ReplyKind::Fail => ReplyCode::Fail,
-            _ => ReplyCode::Other,
+            ReplyKind::UnknownCommand => ReplyCode::Other,
         };
         let sent = match beside {
             true => self.beside.take(),

@@ -120,7 +120,7 @@ impl EngineView<'_> {
                 .filter(|(_, _, field)| field.element().is_some())
                 .fold(outputs, |count, _| count.saturating_add(1));
         }
-        let is_tcp = |(_, port, _): &(u8, &Port, &Recipe)| matches!(port.bus, Bus::ModbusTcp { .. });
+        let is_tcp = |(_, port, _): &(u8, &Port, &Recipe)| port.bus.is_modbus_tcp();
         let devices = config.field_ports().filter(is_tcp).count();
         let texts = if commands == 0 { &[] } else { config.commands };
         let bytes = texts.iter().map(|entry| entry.text.len()).fold(0, usize::saturating_add);

@@ -231,7 +231,7 @@ impl EngineView<'_> {
             Bus::Rs485(line) => Some(line),
             _ => None,
         };
-        let is_tcp = matches!(port.bus, Bus::ModbusTcp { .. });
+        let is_tcp = port.bus.is_modbus_tcp();
         let mut hears_unasked = part_frames(Direction::Input) > 0;
         self.store.watches_bits |= exchanges.iter().any(|exchange| exchange.when.rising.is_some());
         for (nth, exchange) in exchanges.iter().enumerate() {
