@@ -156,8 +156,8 @@ impl<'a> PortStatus<'a> {
     pub fn peers(&self) -> impl Iterator<Item = PeerStatus> + use<'a> {
         self.peers.iter().map(|peer| PeerStatus {
             number: peer.number,
-            presence: peer.turn.presence(),
-            missed_periods: peer.turn.missed(),
+            presence: peer.presence(),
+            missed_periods: peer.missed(),
             counters: peer.counters,
         })
     }
@@ -369,7 +369,7 @@ impl<'a> Status<'a> {
             name: &port.name,
             bus,
             recipe: port.recipe,
-            state: port.state(overdue > 0 || peers.iter().any(PeerState::is_down)),
+            state: port.state(overdue > 0 || peers.iter().any(PeerState::is_away)),
             age: heard_at.map(|at| self.at.saturating_since(at)),
             overdue,
             reply: port.reply,

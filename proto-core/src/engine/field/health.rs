@@ -98,5 +98,5 @@ pub(crate) fn state_of(
 ) -> PortState {
     let mut own = frames.iter().filter(|frame| usize::from(frame.port) == index);
     let peers = port.line().map_or(&[][..], |line| line.peers.of(peers));
-    port.state(own.any(InputFrame::is_overdue) || peers.iter().any(PeerState::is_down))
+    port.state(own.any(InputFrame::is_overdue) || peers.iter().any(PeerState::is_away))
 }

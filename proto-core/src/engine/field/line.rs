@@ -408,6 +408,7 @@ impl Line {
         let sent = self.sent;
         let retries = table.row_of(flight).map_or(0, |row| row.retries(flight.cause));
         let Some(peer) = table.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
+        let is_there = peer.presence() == Presence::Up;
         let counters = &mut peer.counters;
         let counter = match failure {
             Failure::Timeout | Failure::Pending => &mut counters.timeouts,
@@ -428,8 +429,7 @@ impl Line {
         let unanswered =
             if failure == Failure::Checksum { flight.unanswered } else { flight.unanswered.min(sent) };
         // The peer has the request of which it said that it is at it.
-        if peer.turn.presence() == Presence::Up && flight.repeated < retries && !flight.is_pending && !yields
-        {
+        if is_there && flight.repeated < retries && !flight.is_pending && !yields {
             counters.retries = counters.retries.wrapping_add(1);
             let repeated = flight.repeated.saturating_add(1);
             let was_wrong = flight.was_wrong || failure == Failure::Checksum;

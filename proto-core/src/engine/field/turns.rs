@@ -136,9 +136,12 @@ struct Wait {
     is_busy: bool,
 }
 
-/// What is known of one that answers, or does not.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Turn {
+/// One peer of a line, and whether it answers.
+#[derive(Debug, Clone)]
+pub(crate) struct PeerState {
+    /// Address of the slave, or number of the device.
+    pub number: u8,
+    pub counters: PeerCounters,
     presence: Presence,
     /// It was heard since the line began.
     was_heard: bool,
@@ -151,22 +154,6 @@ pub(crate) struct Turn {
     nevertheless: Instant,
     missed: u32,
     absent: Duration,
-}
-
-/// One peer of a line.
-#[derive(Debug, Clone)]
-pub(crate) struct PeerState {
-    /// Address of the slave, or number of the device.
-    pub number: u8,
-    pub counters: PeerCounters,
-    pub turn: Turn,
-}
-
-impl PeerState {
-    /// Whether it did not answer when it was last asked.
-    pub(crate) fn is_down(&self) -> bool {
-        self.turn.presence() == Presence::Down
-    }
 }
 
 /// Why a row was taken.
@@ -223,9 +210,11 @@ fn wait(failures: u8, timeout: Duration) -> Duration {
     timeout.saturating_mul(1_u64.wrapping_shl(u32::from(failures.min(LONGEST_WAIT)))).min(longest)
 }
 
-impl Turn {
-    pub(crate) const fn new(absent: Duration) -> Self {
+impl PeerState {
+    pub(crate) fn new(number: u8, absent: Duration) -> Self {
         Self {
+            number,
+            counters: PeerCounters::default(),
             presence: Presence::Unknown,
             was_heard: false,
             failing_since: Instant::NEVER,
@@ -240,7 +229,8 @@ impl Turn {
 
     /// It may be another one.
     fn forget(&mut self) {
-        *self = Self { missed: self.missed, ..Self::new(self.absent) };
+        let (counters, missed) = (self.counters, self.missed);
+        *self = Self { counters, missed, ..Self::new(self.number, self.absent) };
     }
 
     pub(crate) const fn presence(&self) -> Presence {
@@ -252,7 +242,8 @@ impl Turn {
         self.missed
     }
 
-    fn is_away(&self) -> bool {
+    /// Whether it did not answer when it was last asked.
+    pub(crate) fn is_away(&self) -> bool {
         self.presence == Presence::Down
     }
 
@@ -434,7 +425,7 @@ impl Turns<'_> {
     /// The line begins anew.
     pub(crate) fn begin(&mut self, now: Instant) {
         self.rows.iter_mut().for_each(|row| row.begin(now));
-        self.peers.iter_mut().for_each(|peer| peer.turn.forget());
+        self.peers.iter_mut().for_each(|peer| peer.forget());
         *self.run = 0;
     }
 
@@ -445,8 +436,8 @@ impl Turns<'_> {
             self.failed(nth, cause, now, now);
         }
         for peer in &mut *self.peers {
-            if peer.turn.failing_since == Instant::NEVER {
-                (peer.turn.failing_since, peer.turn.failing_until) = (now, now);
+            if peer.failing_since == Instant::NEVER {
+                (peer.failing_since, peer.failing_until) = (now, now);
             }
         }
     }
@@ -459,9 +450,9 @@ impl Turns<'_> {
                 *grid = Grid::starting_at(now, grid.period());
             }
         }
-        for turn in self.peers.iter_mut().map(|peer| &mut peer.turn) {
-            turn.presence = Presence::Unknown;
-            (turn.not_before, turn.nevertheless, turn.failing_until) = (Instant::ZERO, Instant::ZERO, now);
+        for peer in &mut *self.peers {
+            peer.presence = Presence::Unknown;
+            (peer.not_before, peer.nevertheless, peer.failing_until) = (Instant::ZERO, Instant::ZERO, now);
         }
         *self.run = 0;
     }
@@ -479,7 +470,7 @@ impl Turns<'_> {
         let (mut look_again, mut next_due) = (Instant::NEVER, Instant::NEVER);
         let is_opening = self.rows.iter().any(|row| row.opens == Opens::Yes);
         for (nth, row) in self.rows.iter().enumerate() {
-            let Some(peer) = self.peers.get(usize::from(row.peer)).map(|peer| &peer.turn) else { continue };
+            let Some(peer) = self.peers.get(usize::from(row.peer)) else { continue };
             if let Some(at) = row.stop_at() {
                 if at > now {
                     look_again = look_again.min(at);
@@ -569,7 +560,7 @@ impl Turns<'_> {
 
     /// Whether another row of the peer is to be asked at its start before this one.
     fn waits_for_opening(&self, nth: usize, row: &Row) -> bool {
-        let is_away = self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.turn.is_away());
+        let is_away = self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.is_away());
         let comes = |other: &Row| {
             other.opens == Opens::Yes
                 && other.peer == row.peer
@@ -584,7 +575,7 @@ impl Turns<'_> {
     /// perhaps away may be carried out without a reply, and once more when the peer is heard.
     fn start_waits(&self, row: &Row) -> bool {
         let tells = |other: &Row| other.peer == row.peer && other.kind.is_answered && other.grid.is_some();
-        let turn = self.peers.get(usize::from(row.peer)).map(|peer| &peer.turn);
+        let turn = self.peers.get(usize::from(row.peer));
         let waits = match row.start {
             Start::Over => false,
             Start::Wanted => turn.is_some_and(|turn| turn.presence != Presence::Up && !turn.is_mute()),
@@ -610,7 +601,7 @@ impl Turns<'_> {
         let requested = core::mem::replace(&mut row.requested, Instant::NEVER);
         let requested = Some(requested).filter(|at| *at != Instant::NEVER);
         let cause = if is_start { Cause::Start } else { Cause::State(requested) };
-        if let Some(peer) = self.peers.get_mut(usize::from(row.peer)).map(|peer| &mut peer.turn)
+        if let Some(peer) = self.peers.get_mut(usize::from(row.peer))
             && !peer.is_away()
         {
             let missed = u32::try_from(missed).unwrap_or(u32::MAX);
@@ -665,11 +656,10 @@ impl Turns<'_> {
     /// A sign of life of a peer, beside the row whose reply it is.
     pub(crate) fn heard(&mut self, which: u8, own: Option<usize>, now: Instant) -> News {
         let Some(peer) = self.peers.get_mut(usize::from(which)) else { return News::Nothing };
-        let turn = &mut peer.turn;
-        let was_away = turn.is_away();
-        let has_started = turn.was_absent();
-        (turn.presence, turn.was_heard, turn.failures) = (Presence::Up, true, 0);
-        turn.failing_since = Instant::NEVER;
+        let was_away = peer.is_away();
+        let has_started = peer.was_absent();
+        (peer.presence, peer.was_heard, peer.failures) = (Presence::Up, true, 0);
+        peer.failing_since = Instant::NEVER;
         for row in self.rows.iter_mut().filter(|row| row.peer == which) {
             row.is_missed = false;
             // Its request, or the reply, was lost; nobody knows which.
@@ -704,7 +694,7 @@ impl Turns<'_> {
     pub(crate) fn failed(&mut self, nth: usize, cause: Cause, now: Instant, sent: Instant) -> News {
         let Some(row) = self.rows.get_mut(nth) else { return News::Nothing };
         let (timeout, which) = (row.times.timeout, row.peer);
-        let Some(peer) = self.peers.get_mut(usize::from(which)).map(|peer| &mut peer.turn) else {
+        let Some(peer) = self.peers.get_mut(usize::from(which)) else {
             return News::Nothing;
         };
         if row.opens == Opens::Taken {
@@ -731,7 +721,7 @@ impl Turns<'_> {
         if !was_away && !self.is_silent(which) {
             return News::Nothing;
         }
-        let Some(peer) = self.peers.get_mut(usize::from(which)).map(|peer| &mut peer.turn) else {
+        let Some(peer) = self.peers.get_mut(usize::from(which)) else {
             return News::Nothing;
         };
         let wait = wait(peer.failures, timeout);
@@ -762,7 +752,7 @@ impl Turns<'_> {
     /// is only asked when something happens is still away.
     pub(crate) fn is_known_to_be_away(&self, which: u8) -> bool {
         let is_asked = |row: &Row| row.peer == which && row.kind.is_answered && row.grid.is_some();
-        self.peers.get(usize::from(which)).is_some_and(PeerState::is_down) && self.rows.iter().any(is_asked)
+        self.peers.get(usize::from(which)).is_some_and(PeerState::is_away) && self.rows.iter().any(is_asked)
     }
 }
 

@@ -15,8 +15,7 @@ use crate::engine::field::exchanges::{Asks, ExchangeItem, InputFormat, OtherForm
 use crate::engine::field::format::DeviceFormat;
 use crate::engine::field::line::Line;
 use crate::engine::field::modbus_tcp::Transactions;
-use crate::engine::field::peer_counters::PeerCounters;
-use crate::engine::field::turns::{PeerState, Row, RowKind, Times, Turn};
+use crate::engine::field::turns::{PeerState, Row, RowKind, Times};
 use crate::modbus::rtu::{BROADCAST, Timing};
 use crate::schedule::Grid;
 use crate::sysvar::Direction;
@@ -266,8 +265,7 @@ impl EngineView<'_> {
                 Some(peer) => peer,
                 None => {
                     let peer = own.len();
-                    let counters = PeerCounters::default();
-                    let new = PeerState { number: exchange.peer, counters, turn: Turn::new(port.absent) };
+                    let new = PeerState::new(exchange.peer, port.absent);
                     self.exchanges.peers.push(new).map_err(|_| full())?;
                     peer
                 }
