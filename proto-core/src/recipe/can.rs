@@ -254,11 +254,13 @@ impl<'a> CanFrameLayout<'a> {
     /// [`ValueError`]: a float that is not finite, or data of another length.
     #[inline]
     pub fn apply(&self, data: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        match self.share.whole.apply(data, image) {
-            Some(applied) => Ok(applied),
-            // Not by `self`, which would have to be in memory on the way above.
-            None => Self::apply_runs(self.layout, self.index, data, image),
+        if data.len() == self.len()
+            && let Some(applied) = self.share.whole.apply(data, image)
+        {
+            return Ok(applied);
         }
+        // Not by `self`, which would have to be in memory on the way above.
+        Self::apply_runs(self.layout, self.index, data, image)
     }
 
     /// The frame with the image's values. User-defined fields have no place there and are zero.

@@ -289,27 +289,12 @@ impl FieldRun {
         self.len as usize
     }
 
-    /// Writes a payload that is one run into the image; `None`, with nothing written, if [`Runs::apply`] or
-    /// [`FrameFields::check`] has to look closer.
+    /// Writes a payload that is one run, and as long as it, into the image; `None`, with nothing written, if
+    /// [`Runs::apply`] or [`FrameFields::check`] has to look closer.
     #[inline(always)]
     pub(super) fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
-        if payload.len() != self.len() {
-            return None;
-        }
-        let target = image.get_mut(self.range())?;
-        self.put_checked(payload, target)
-    }
-
-    /// The same of a payload that is as long as the run, unless the run is nowhere in the image.
-    #[inline(always)]
-    pub(super) fn apply_all(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
         let start = usize::from(self.image);
         let target = image.get_mut(start..start.wrapping_add(payload.len()))?;
-        self.put_checked(payload, target)
-    }
-
-    #[inline(always)]
-    fn put_checked(&self, payload: &[u8], target: &mut [u8]) -> Option<Applied> {
         if self.kind == RunContent::FLOATS {
             return runs::copy_finite(target, payload).then_some(Applied { masked: 0 });
         }

@@ -113,7 +113,7 @@ impl StreamLayout {
     pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
         // Not with the run's length: that a payload of a frame is as long as this one the compiler knows.
         if payload.len() == self.payload_len()
-            && let Some(applied) = self.whole.apply_all(payload, image)
+            && let Some(applied) = self.whole.apply(payload, image)
         {
             return Ok(applied);
         }

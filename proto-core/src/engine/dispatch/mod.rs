@@ -127,8 +127,6 @@ impl EngineView<'_> {
     }
 
     /// The next output, if something may have one.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
-    #[inline(never)]
     pub(crate) fn poll_work<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         self.clock.idle_until = Instant::ZERO;
         let now = self.clock.forward(now);
