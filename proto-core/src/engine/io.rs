@@ -28,12 +28,12 @@ impl LinkId {
     /// The urgent link: a second connection to port 2000, for commands that stop the robot (D26).
     pub const URGENT: Self = Self(FIRST_PORT + MAX_PORTS as u8);
 
-    /// The link of a listening port, or of a port of Modbus TCP.
+    /// The link of a listening port or of a Modbus TCP port.
     pub const fn of_port(port: PortId) -> Self {
         Self(port.0.saturating_add(FIRST_PORT))
     }
 
-    /// The port that the link belongs to, if it belongs to one.
+    /// The port that the link belongs to, if any.
     pub const fn port(self) -> Option<PortId> {
         match self.0.checked_sub(FIRST_PORT) {
             Some(port) if self.0 < Self::URGENT.0 => Some(PortId(port)),
@@ -42,10 +42,10 @@ impl LinkId {
     }
 }
 
-/// First id of the links of ports.
+/// The lowest id of a port's link.
 const FIRST_PORT: u8 = 4;
 
-/// The kind of a link: what the driver opens for it.
+/// The kind of a link: what the driver opens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -65,7 +65,7 @@ pub enum LinkKind {
         /// The port.
         port: PortId,
     },
-    /// UDP: listen on the port's address, answer the newest sender of a frame.
+    /// UDP: listen on the port's address, reply to the newest sender of a frame.
     RecipeUdpListen {
         /// The port.
         port: PortId,
@@ -93,14 +93,14 @@ impl LinkKind {
     }
 }
 
-/// Where a link goes, and how it is opened.
+/// Where a link goes and how it is opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Endpoint<'a> {
-    /// How it is opened, and at which port.
+    /// How it is opened, and on which port.
     pub transport: Transport,
-    /// The controller's or device's address or host name, as configured; empty where the driver learns it
-    /// otherwise. For a listening link, the only peer that may connect or send.
+    /// The controller's or device's address or host name, as configured; empty if the driver learns it otherwise. For a
+    /// listening link, the only peer that may connect or send.
     pub host: &'a str,
 }
 
@@ -120,7 +120,7 @@ pub enum Transport {
         /// The controller's or device's port.
         port: u16,
     },
-    /// Send UDP datagrams from any local port, and receive the answers.
+    /// Send UDP datagrams from any local port, and receive the replies.
     Udp {
         /// The controller's port.
         port: u16,
@@ -130,7 +130,7 @@ pub enum Transport {
         /// The address to listen on; on a board with one address only the port matters.
         local: SocketAddr,
     },
-    /// Receive UDP datagrams, and answer the newest sender.
+    /// Receive UDP datagrams, and reply to the newest sender.
     UdpListen {
         /// The address to listen on; on a board with one address only the port matters.
         local: SocketAddr,
@@ -168,9 +168,9 @@ impl BusState {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum PortState {
-    /// Its input frames arrive in time; a port without an input part only needs its device.
+    /// Its input frames arrive in time. A port without an input part only needs its device.
     Working,
-    /// An input frame is overdue, or none has come yet.
+    /// An input frame is overdue, or none has arrived yet.
     Silent,
     /// The CAN controller has left the bus.
     BusOff,
@@ -199,7 +199,7 @@ pub enum ReplyCode {
     /// No value has picked a command yet.
     #[default]
     None = 0,
-    /// Waiting to be sent, or for a reply.
+    /// Waiting to be sent, or for its reply.
     Pending = 1,
     /// The controller replied that it succeeded.
     Success = 2,
@@ -207,7 +207,7 @@ pub enum ReplyCode {
     Fail = 3,
     /// The controller sent another reply.
     Other = 4,
-    /// No reply came in time, or the link was lost before the reply.
+    /// No reply arrived in time, or the link was lost before it.
     NoReply = 5,
     /// It was not sent: the link was down, or too many commands were waiting.
     NotSent = 6,
@@ -232,13 +232,12 @@ impl ReplyCode {
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub enum Input<'a> {
-    /// A port's device is ready. Not for a port of Modbus TCP, which has a link.
+    /// A port's device is ready. Not used for a Modbus TCP port, which has a link.
     PortUp {
         /// The port.
         port: PortId,
     },
-    /// A port's device is gone. What was handed over for sending is lost, and no
-    /// [`Input::PortSent`] follows for it.
+    /// A port's device is gone. What was handed over for sending is lost, and no [`Input::PortSent`] follows.
     PortDown {
         /// The port.
         port: PortId,
@@ -274,8 +273,7 @@ pub enum Input<'a> {
         /// The link.
         link: LinkId,
     },
-    /// A link could not be opened, or was lost. No [`Input::LinkSent`] follows for what was handed
-    /// over to it.
+    /// A link could not be opened, or was lost. No [`Input::LinkSent`] follows for what was handed over to it.
     LinkDown {
         /// The link.
         link: LinkId,
@@ -287,33 +285,31 @@ pub enum Input<'a> {
         /// The bytes.
         bytes: &'a [u8],
     },
-    /// The transport has taken everything handed over, and has room for more. It says nothing about
-    /// delivery.
+    /// The transport has taken everything handed over and has room for more. This says nothing about delivery.
     LinkSent {
         /// The link.
         link: LinkId,
     },
-    /// How much of what was handed over to a TCP link since it came up has not been acknowledged by
-    /// the peer's transport. Report it before bytes that arrived, and at least every 20 ms while
-    /// the number changes; never for a datagram link.
+    /// How many of the bytes handed over to a TCP link since it came up the peer's transport has not acknowledged.
+    /// Report it before bytes that arrived, and at least every 20 ms while the number changes; never for a datagram
+    /// link.
     LinkAcked {
         /// The link.
         link: LinkId,
-        /// Unacknowledged bytes, including those that the driver itself still holds.
+        /// Unacknowledged bytes, including those the driver still holds.
         left: u32,
     },
-    /// Time has passed, and everything that arrived before has been reported. Only this input lets
-    /// deadlines pass.
+    /// Time has passed, and everything that arrived before has been reported. Only this input lets deadlines pass.
     Tick,
 }
 
-/// Whether anything comes of an input.
+/// Whether an input may have produced an output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Handled {
     /// Call [`super::Engine::poll_output`] until it is [`Output::Sleep`].
     Poll,
-    /// Nothing: the engine sleeps on, until the instant of the newest [`Output::Sleep`]. Polling it is harmless.
+    /// Nothing to do: the engine sleeps until the instant of the newest [`Output::Sleep`]. Polling it is harmless.
     Asleep,
 }
 
@@ -328,8 +324,8 @@ pub enum Output<'a> {
         /// One whole frame.
         bytes: &'a [u8],
     },
-    /// Queue a CAN frame after the previous ones; report [`Input::PortSent`] when the queue is
-    /// empty. At most [`crate::recipe::model::MAX_CAN_IDS`] frames are handed over before that.
+    /// Queue a CAN frame after the previous ones; report [`Input::PortSent`] when the queue is empty. At most
+    /// [`crate::recipe::model::MAX_CAN_IDS`] frames are handed over before that.
     PortSendCan {
         /// The port.
         port: PortId,
@@ -343,8 +339,8 @@ pub enum Output<'a> {
         /// Where it goes.
         to: Endpoint<'a>,
     },
-    /// Close a link at once and report nothing more about it. Close TCP with a reset: what the peer
-    /// has not acknowledged must not be delivered later.
+    /// Close a link at once and report nothing more about it. Reset TCP connections: unacknowledged bytes must not be
+    /// delivered later.
     LinkClose {
         /// The link.
         link: LinkId,

@@ -1,16 +1,14 @@
 //! The gateway: one run loop over field ports and controller links, without I/O (docs/engine.md).
 //!
-//! One rule: change the engine once with [`Engine::handle`], then drain [`Engine::poll_output`]
-//! until it returns [`Output::Sleep`]. Polling early is harmless. The engine never reads a clock,
-//! never sleeps, never does I/O and never allocates; the work of a call is bounded by the size of
-//! the configuration and of its input.
+//! One rule: change the engine once with [`Engine::handle`], then drain [`Engine::poll_output`] until it returns
+//! [`Output::Sleep`]. Polling early is harmless. The engine never reads a clock, never sleeps, never does I/O and never
+//! allocates; the work of a call is bounded by the size of the configuration and of its input.
 //!
-//! Arrival decides what is late: only [`Input::Tick`] lets a deadline pass, so input that waited
-//! while the driver was busy still counts. After more than [`ASLEEP`] without a call the age of
-//! such input is unknown, and it is discarded.
+//! Only [`Input::Tick`] lets a deadline pass, so input that waited while the driver was busy still counts as in time.
+//! After more than [`ASLEEP`] without a call the age of waiting input is unknown, and it is discarded.
 //!
-//! Errors of a device or of the controller are counted and skipped. They are never an error of the
-//! run loop. Nothing is applied in part, but for frames of devices, whose fields are judged one by one.
+//! Errors of a device or of the controller are counted and skipped; the run loop never fails because of them. A frame
+//! is applied as a whole or not at all, except for device frames, whose fields are judged one by one.
 
 mod build_error;
 mod clock;
@@ -84,15 +82,15 @@ pub const OUTPUT_BUFFER: usize = MAX_STREAM_FRAME;
 pub const INPUT_BUFFER: usize = 1536;
 const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 
-/// The gateway engine for up to `PORTS` field ports, `UPLINKS` recipe links and, over all ports,
-/// `FIELDS` user-defined input fields and as many output fields.
+/// The gateway engine for up to `PORTS` field ports, `UPLINKS` recipe links and, over all ports, `FIELDS` user-defined
+/// input fields and as many output fields.
 ///
-/// `TAP` bytes are for the ring of [`Engine::tap`], and `EXCHANGES` is the number of exchanges with
-/// devices over all ports; 0 costs nothing. The defaults are the maximum of a file.
+/// `TAP` is the size in bytes of the ring of [`Engine::tap`], and `EXCHANGES` the number of exchanges with devices over
+/// all ports; 0 costs nothing. The defaults are the maximum of a configuration file.
 ///
 /// `Engine<4, 1, 128, 0, 0>` takes less than 42 KiB.
-// In this order, because an engine is larger than what one instruction reaches: what every call looks at
-// comes first, what only some configurations have comes last.
+// An engine is larger than the address range of one instruction, so what every call reads comes first, and what only
+// some configurations have comes last.
 #[derive(Debug, Clone)]
 #[repr(C)]
 pub struct Engine<
@@ -108,7 +106,7 @@ pub struct Engine<
     state: Maybe<StateLink>,
     modbus: Maybe<ModbusLink>,
     recipes: Vec<Uplink, UPLINKS>,
-    /// Connections to devices: together with the recipe links as many as those may be.
+    /// Connections to devices; at most as many as recipe links.
     devices: Vec<DeviceLink, UPLINKS>,
     store: Store<Vec<EdgeQueue, PORTS>>,
     ports: Vec<FieldPort, PORTS>,
@@ -133,7 +131,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
 
     /// An engine without a configuration: no ports, no links, nothing to do.
     ///
-    /// All its bytes are zero, so that a `static` one takes no flash, and no stack.
+    /// All its bytes are zero, so a `static` engine takes no flash and is not built on the stack.
     pub const fn idle() -> Self {
         Self {
             clock: Clock::START,
@@ -158,19 +156,18 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// An engine that runs this configuration. All ports and links are down until the driver
-    /// reports otherwise.
+    /// An engine that runs this configuration. All ports and links are down until the driver reports otherwise.
     ///
     /// # Errors
-    /// [`BuildError`] says what is wrong with the configuration, or what there is no room for.
+    /// [`BuildError`] says what is wrong with the configuration, or what it has too many of.
     pub fn new<'c>(config: impl Into<ConfigView<'c>>) -> Result<Self, BuildError> {
         let mut engine = Self::idle();
         engine.configure(config)?;
         Ok(engine)
     }
 
-    /// Runs this configuration from now on, and forgets the previous one. The engine is built in
-    /// place: for boards whose stack is smaller than a few engines.
+    /// Runs this configuration from now on instead of the previous one. The engine is built in place, for boards whose
+    /// stack is smaller than a few engines.
     ///
     /// # Errors
     /// Same as [`Engine::new`]; the engine is idle then.
@@ -183,7 +180,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         done
     }
 
-    /// Forgets the configuration. A tap that listens continues.
+    /// Removes the configuration. A listening tap keeps listening.
     fn clear(&mut self) {
         self.store = Store::new(Vec::new());
         self.view().clear();
@@ -230,13 +227,13 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         }
     }
 
-    /// Reports an event, or that time has passed. `now` is the present; an instant earlier than
-    /// that of the previous call counts as the previous one.
+    /// Reports an event, or that time has passed. If `now` is earlier than in the previous call, that call's instant is
+    /// used.
     ///
     /// Inputs for a port or link that the configuration does not have are ignored.
     ///
-    /// The answer spares a driver [`Self::poll_output`] where nothing comes of an input; it may be ignored.
-    // A frame byte by byte to UDP takes 4923 instructions if this is out of line, and 4282 inline.
+    /// [`Handled::Asleep`] spares a driver the call of [`Self::poll_output`]; it may be ignored.
+    // A frame byte by byte to UDP takes 4923 instructions with this out of line, 4282 with it inline.
     #[inline(always)]
     pub fn handle(&mut self, now: Instant, input: Input<'_>) -> Handled {
         let handled = match input {
@@ -253,10 +250,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.view().handle(now, input)
     }
 
-    /// The fast path for other inputs of which nothing comes while the engine sleeps and no deadline has come: frames for
-    /// other nodes, which are most of a busy CAN bus, pieces of a state packet, and transmissions that are over before
-    /// something else is to be sent. `None` if the input has to be handled; then nothing was changed.
-    // It saves a frame to UDP 230 instructions of 1360.
+    /// The fast path for inputs other than port bytes that have no effect while the engine sleeps and no deadline has
+    /// come: frames for other nodes (most of a busy CAN bus), pieces of a state packet, and finished transmissions with
+    /// nothing else to send yet. `None` if the input has to be handled; nothing has changed then.
+    // Saves 230 of 1360 instructions for a frame to UDP.
     #[inline(never)]
     fn handle_idle(&mut self, now: Instant, input: &Input<'_>) -> Option<Handled> {
         let mut handled = Handled::Asleep;
@@ -267,7 +264,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
             Input::LinkBytes { link: LinkId::STATE, bytes } if !self.tap.is_listening() => {
                 self.state.first_mut()?.hold(bytes, now).then_some(())?;
             }
-            // An engine without ports may have missed a beat.
+            // An engine without ports may have missed a heartbeat.
             Input::PortSent { .. } | Input::LinkSent { .. } if now >= self.clock.beat_at => return None,
             Input::PortSent { port } if self.exchanges.is_empty() => {
                 find_port(&mut self.ports, port)?.sender.sent_before_next().then_some(())?;
@@ -296,11 +293,10 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         Some(handled)
     }
 
-    /// The next output for the driver. Call it again until it is [`Output::Sleep`]. Nothing is sent
-    /// between a deadline and the [`Input::Tick`] that lets it pass.
+    /// The next output for the driver. Call it again until it is [`Output::Sleep`]. Nothing is sent between a deadline
+    /// and the [`Input::Tick`] that lets it pass.
     ///
-    /// What stops the robot comes first, then what brings field values to the controller, then what
-    /// keeps links up, then what goes to the field.
+    /// Order: commands that stop the robot, field values for the controller, what keeps links up, frames to the field.
     pub fn poll_output<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         if now < self.clock.idle_until {
             debug_assert!(self.clock.is_quiet(now) && !self.clock.is_overdue);
@@ -313,14 +309,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.poll_awake(now, buf)
     }
 
-    // Out of line for the same reason.
+    // Out of line for the same reason as `handle_awake`.
     #[inline(never)]
     fn poll_awake<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         self.view().poll_work(now, buf)
     }
 
-    /// When the engine has something to do without an input, computed exactly. [`Output::Sleep`]
-    /// may be earlier, never later.
+    /// The exact time at which the engine has something to do without an input. [`Output::Sleep`] may be earlier, never
+    /// later.
     pub fn deadline(&self) -> Instant {
         let has_exchanges = !self.exchanges.is_empty();
         let (firm, partial) =
@@ -359,33 +355,33 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.links_view().infos()
     }
 
-    /// Whether a link is up; false if the configuration does not need it. [`Self::links`] tells more of it.
+    /// Whether a link is up; false if the configuration does not need it. See [`Self::links`] for more.
     pub fn is_up(&self, link: LinkId) -> bool {
         self.links_view().is_up(link)
     }
 
-    /// Whether a datagram is a frame of the link's output part. The driver of a listening UDP link
-    /// checks this before it answers another sender than before.
+    /// Whether a datagram is a frame of the link's output part. The driver of a listening UDP link checks this before
+    /// it replies to a new sender.
     pub fn is_frame(&self, link: LinkId, datagram: &[u8]) -> bool {
         self.recipes.iter().any(|other| other.id == link && other.is_frame(datagram))
     }
 
-    /// How often the gateway itself slept: it was not called for longer than [`ASLEEP`], so waiting
-    /// input was discarded. Wraps.
+    /// How often the gateway itself slept: it was not called for longer than [`ASLEEP`], so waiting input was
+    /// discarded. Wraps.
     pub fn sleeps(&self) -> u32 {
         self.clock.sleeps
     }
 
-    /// Prepares the end of the engine: at the next [`Input::Tick`] every input frame that is not
-    /// overdue yet becomes so, as if all devices were silent. Values that wait are dropped and safe values go
-    /// out; a port that is never overdue keeps its values. The driver reports nothing more of its ports, and
-    /// ends the engine when [`Self::is_safe`] says so, or after some time.
+    /// Prepares to end the engine: at the next [`Input::Tick`] every input frame becomes overdue, as if all devices
+    /// were silent. Waiting values are dropped and safe values are sent; a port that is never overdue keeps its values.
+    /// The driver reports no more input from its ports, and ends the engine when [`Self::is_safe`] returns true or
+    /// after some time.
     pub fn make_safe(&mut self) {
         self.view().make_safe();
     }
 
-    /// Whether the controller is known to have every safe value that was sent to it. Where nothing shows a
-    /// value, it is never known.
+    /// Whether the controller is known to have every safe value that was sent to it. Never true for a value that
+    /// nothing shows.
     pub fn is_safe(&self) -> bool {
         let store: &Store = &self.store;
         store.is_safe()
@@ -413,7 +409,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         &self.store.latency
     }
 
-    /// The ring of records of everything that goes over ports and links.
+    /// The ring of records of everything that passes over ports and links.
     pub fn tap(&mut self) -> &mut Tap {
         &mut self.tap
     }

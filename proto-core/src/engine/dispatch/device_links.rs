@@ -1,4 +1,4 @@
-//! What the driver reports of connections to devices: a port of Modbus TCP is there while its connection is.
+//! Link inputs of connections to devices: a Modbus TCP port is up while its connection is.
 
 use super::EngineView;
 use crate::engine::clock::Dirty;
@@ -11,12 +11,12 @@ use crate::engine::link::device::{DeviceLink, PATIENCE};
 use crate::time::Instant;
 
 impl EngineView<'_> {
-    /// The connection of a port of Modbus TCP, if the link is one.
+    /// The connection to devices with this id, if there is one.
     pub(crate) fn device_link(&mut self, id: LinkId) -> Option<&mut DeviceLink> {
         self.links.devices.iter_mut().find(|link| link.id() == id)
     }
 
-    /// Whether a port's devices are at the other end of a connection.
+    /// Whether a port reaches its devices over a connection.
     pub(crate) fn has_connection(&self, port: PortId) -> bool {
         self.links.devices.iter().any(|link| link.port == port)
     }
@@ -53,7 +53,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// Bytes of a connection that is up; those of one that was given up are nobody's.
+    /// Takes bytes of a connection that is up. Bytes of a connection that was given up are ignored.
     pub(crate) fn device_bytes(&mut self, id: LinkId, bytes: &[u8], now: Instant) {
         let Some(link) = self.device_link(id).filter(|link| link.supervisor.is_up()) else { return };
         link.supervisor.heard(now);
@@ -69,7 +69,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// Notes a request that was handed over to a port's connection; false if the port is on a bus of its own.
+    /// Notes a request that was handed over to a port's connection; false if the port has none.
     pub(crate) fn goes_over_link(&mut self, id: PortId, now: Instant) -> bool {
         if self.links.devices.is_empty() {
             return false;
@@ -101,13 +101,12 @@ impl EngineView<'_> {
         }
     }
 
-    /// Handles the clock.
     pub(crate) fn advance_connections(&mut self, now: Instant) {
         self.links.devices.iter_mut().for_each(|link| link.advance(now));
         self.carry_connections(now);
     }
 
-    /// A port is there while its connection is.
+    /// Brings ports up and down with their connections.
     fn carry_connections(&mut self, now: Instant) {
         for nth in 0..self.links.devices.len() {
             let Some(link) = self.links.devices.get(nth) else { break };

@@ -1,4 +1,4 @@
-//! Exchanges on all ports: which port an input is for, and which has the next request.
+//! Exchanges on all ports: passes inputs to the right port, and finds the next request.
 
 use super::EngineView;
 use crate::engine::OUTPUT_BUFFER;
@@ -14,7 +14,7 @@ use crate::time::Instant;
 use crate::wire::can::CanFrame;
 
 impl EngineView<'_> {
-    /// The output of a request, with its record.
+    /// The output for a request; also records it in the tap.
     pub(crate) fn request_output<'b>(
         &mut self,
         (port, request): (PortId, Downward),
@@ -38,7 +38,7 @@ impl EngineView<'_> {
     }
 
     /// Takes bytes; false if the port's recipe has no exchanges.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
+    // The cost is in docs/performance.md section 1, like that of the other attributes here.
     #[cold]
     pub(crate) fn exchange_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
         let Some(port) = find_port(self.ports, id) else { return false };
@@ -93,7 +93,7 @@ impl EngineView<'_> {
         true
     }
 
-    /// Values in the image have changed: looks at the bits that ask, on all ports.
+    /// Values in the image have changed: checks the bits that trigger requests, on all ports.
     pub(crate) fn check_events(&mut self) {
         let now = self.store.now;
         for nth in 0..self.ports.len() {
@@ -109,14 +109,14 @@ impl EngineView<'_> {
             let was_due = port.has_failed(now);
             port.triggers(image, self.bindings.outputs(), view, (first_of_links, up_since), now);
             if !was_due && port.has_failed(now) {
-                // What is pending yields to a stop.
+                // A pending request yields to a stop.
                 port.advance_exchange(self.exchanges.view(), now);
             }
             self.after_exchange(id);
         }
     }
 
-    /// Tells the robot what became of events, if that is new or to be repeated.
+    /// Reports the outcomes of events to the robot: the new ones, or all if `repeats`.
     pub(crate) fn tell_outcomes(&mut self, repeats: bool) {
         let mut told = InputSet::EMPTY;
         for item in self.exchanges.items.iter_mut() {
@@ -140,24 +140,24 @@ impl EngineView<'_> {
         }
     }
 
-    /// The line may be free, or wait for something else.
+    /// Updates flags and deadlines after a change: the line may be free, or wait for something else.
     fn after_exchange(&mut self, id: PortId) {
         self.tell_outcomes(false);
         self.clock.dirty.add(Dirty::PORTS);
         if let Some(port) = find_port(self.ports, id) {
             port.note_partial();
-            // Each by itself: what is due already must not hide the other.
+            // Armed one by one, because one that has passed must not hide the other.
             let (deadlines, has_failed) =
                 ([port.deadline(), port.exchange_deadline()], port.has_failed(self.clock.now));
             deadlines.into_iter().for_each(|at| self.arm(at));
             if has_failed {
-                // A wrong reply came before the request had left, and the line is silent already.
+                // A wrong reply came before the request had left, and the line is already silent.
                 self.tick_again();
             }
         }
     }
 
-    /// A value is as old as the first request that it may answer, and may be overdue when it comes.
+    /// A value is as old as the first request it may answer, so it may be overdue on arrival.
     fn note_overdue(&mut self) {
         if self.store.deadline() <= self.clock.now {
             self.tick_again();
@@ -171,7 +171,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// The device is there.
+    /// The port's device is up.
     pub(crate) fn exchanges_begin(&mut self, id: PortId) {
         if let Some(port) = find_port(self.ports, id) {
             port.begin_exchange(self.exchanges.view(), self.clock.now);
@@ -179,14 +179,14 @@ impl EngineView<'_> {
         }
     }
 
-    /// The device is gone.
+    /// The port's device is gone.
     pub(crate) fn exchanges_end(&mut self, id: PortId) {
         if let Some(port) = find_port(self.ports, id) {
             port.abandon_exchange(self.exchanges.view(), self.clock.now);
         }
     }
 
-    /// The gateway slept.
+    /// The gateway slept: abandons all exchanges.
     pub(crate) fn exchanges_slept(&mut self) {
         for port in self.ports.iter_mut() {
             port.abandon_exchange(self.exchanges.view(), self.clock.now);
@@ -204,7 +204,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// A master's request has ended.
+    /// A request of a master is complete.
     fn serve(&mut self, id: PortId, now: Instant) {
         self.show_health(now);
         let (store, command) = (&mut *self.store, self.links.command.first_mut());
@@ -218,7 +218,7 @@ impl EngineView<'_> {
         self.after_field(id, &accepted, now);
     }
 
-    /// The next request of a port.
+    /// The next request or reply, of any port.
     pub(crate) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
         if self.clock.has_slept {
             return None;
@@ -240,7 +240,7 @@ impl EngineView<'_> {
             let view = self.exchanges.view();
             let request = port.next_request(&self.store.image, self.bindings.outputs(), view, out, now);
             found = request.map(|downward| (port.id, downward));
-            // What is due already must not hide another port's.
+            // A deadline that has passed must not hide another port's.
             first = Some(port.exchange_deadline()).filter(|at| *at > now).map_or(first, |at| first.min(at));
         }
         self.arm(first);

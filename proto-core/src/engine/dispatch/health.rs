@@ -1,7 +1,7 @@
-//! The health of ports and links as values, for output fields and for variables that tell the robot.
+//! The health of ports and links as values, for output fields and for variables that the robot reads.
 //!
-//! In: the ports' states and counters, the states of links. Out: extra values of the image just before a frame is made;
-//! variables, which go up as those of a field frame do. Does not know how they are written.
+//! In: states and counters of ports, states of links. Out: extra values of the image, set just before a frame is made;
+//! variables, sent to the controller like those of a field frame. Does not know how they are written.
 
 use super::EngineView;
 use crate::config::PortValue;
@@ -35,7 +35,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// Sets the extra values that output fields show of the ports' health, and of links.
+    /// Sets the extra values through which output fields show the health of ports and links.
     pub(crate) fn show_health(&mut self, now: Instant) {
         for nth in 0..self.health.shown.len() {
             let Some(&Shown { of, extra }) = self.health.shown.get(nth) else { break };
@@ -47,8 +47,8 @@ impl EngineView<'_> {
         }
     }
 
-    /// Tells the robot what has changed and shows the field the present, just before the cycles of
-    /// the ports that show it.
+    /// Reports changes to the robot, and updates the values for the field just before the cycles of the ports that show
+    /// them.
     pub(crate) fn check_health(&mut self, now: Instant) {
         if self.health.is_reported && now >= self.health.report_at {
             self.tell_changes(now);
@@ -61,7 +61,7 @@ impl EngineView<'_> {
         self.store.check_health_at(next.min(report_at));
     }
 
-    /// Tells the robot what has changed, and now and then everything.
+    /// Reports changes to the robot, and everything from time to time.
     fn tell_changes(&mut self, now: Instant) {
         let repeats = now >= self.health.repeat_at;
         if repeats {
@@ -74,7 +74,7 @@ impl EngineView<'_> {
         self.store.image.stamp(self.health.group, now);
     }
 
-    /// Tells the robot at once whether ports work.
+    /// Reports at once to the robot whether ports work.
     pub(crate) fn tell_alive(&mut self, now: Instant) {
         self.tell_health(|value| value == PortValue::Alive, false, now);
     }
@@ -92,7 +92,7 @@ impl EngineView<'_> {
             if last == Some(number) && !repeats {
                 continue;
             }
-            // The value has the variable's type.
+            // Cannot fail: the value has the variable's type.
             let _ = self.store.image.set(var, scalar_of(var, value, number));
             news.insert(var);
             if let Some(own) = self.health.variables.get_mut(nth) {
@@ -106,7 +106,7 @@ impl EngineView<'_> {
     }
 }
 
-/// The value of a variable that shows a port's health.
+/// The value of a port's health in the type of its variable.
 fn scalar_of(var: SysVar, value: PortValue, number: u32) -> Scalar {
     if value.is_count() {
         wrapping_count(var.ty(), number)

@@ -1,7 +1,7 @@
-//! What the driver reports of links. Those of connections to devices are passed on (`device_links.rs`).
+//! Link inputs. Those of connections to devices are passed on (`device_links.rs`).
 //!
-//! In: a link is up or down, bytes came on it, its transport took some. Out: values in the store, results of commands,
-//! and which ports and links may have an output now. Does not know what travels on a link.
+//! In: a link came up or went down, received bytes, or its transport took some. Out: values in the store, results of
+//! commands, and which ports and links may now have an output. Does not know what travels on a link.
 
 use super::EngineView;
 use crate::engine::clock::Dirty;
@@ -69,7 +69,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// Something happened on a link that may change its deadline, or close it.
+    /// After an event that may change a link's deadline, or close it.
     fn arm_link(&mut self, link: LinkId) {
         self.clock.dirty.add(Dirty::LINKS);
         self.clock.dirty.add(Dirty::ACTIONS);

@@ -1,6 +1,7 @@
-//! The engine whatever its capacities, and its dispatcher: which part an input is for, and which has the next output.
+//! The engine independent of its capacities, and its dispatcher: which part handles an input, and which has the next
+//! output.
 //!
-//! In: inputs of the driver, the time. Out: the next output. Does not know how its parts do what they do.
+//! In: inputs of the driver, the time. Out: the next output. Does not know how the parts work.
 
 mod device_links;
 mod exchanges;
@@ -29,10 +30,10 @@ use crate::link::LinkAction;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;
 
-/// Bytes that a driver may report before a frame is complete. More are likely to have its end.
+/// Longer input is likely to complete a frame, so it skips the fast path.
 const SHORT: usize = 16;
 
-/// The parts of an engine, without its capacities: the code of the engine exists once, whatever they are.
+/// The parts of an engine without its capacities, so that the code exists only once.
 pub(crate) struct EngineView<'e> {
     pub clock: &'e mut Clock,
     pub links: Links<'e>,
@@ -45,10 +46,10 @@ pub(crate) struct EngineView<'e> {
     pub tap: &'e mut Tap,
 }
 
-/// The fast path for bytes that begin or continue a frame and do not end it, which are most calls of a driver that
-/// reports each byte: they set at most the time at which silence ends it. `None` if they have to be looked at; then
-/// nothing was taken.
-// A frame byte by byte to UDP takes 10141 instructions without it.
+/// The fast path for bytes that begin or continue a frame without ending it, which are most calls of a driver that
+/// reports every byte: at most they set the time at which silence ends the frame. `None` if the bytes have to be
+/// examined; nothing was taken then.
+// Without it, a frame byte by byte to UDP takes 10141 instructions.
 #[inline(always)]
 pub(crate) fn hold(
     clock: &mut Clock,
@@ -71,7 +72,7 @@ pub(crate) fn hold(
 }
 
 impl EngineView<'_> {
-    /// Forgets the configuration; the store is empty.
+    /// Removes the configuration. The caller empties the store.
     pub(crate) fn clear(&mut self) {
         *self.clock = Clock::START;
         let Links { host, command, state, modbus, recipes, devices } = &mut self.links;
@@ -106,12 +107,12 @@ impl EngineView<'_> {
     pub(crate) fn handle(&mut self, now: Instant, input: &Input<'_>) -> Handled {
         let was_asleep = self.clock.is_asleep(now);
         let now = self.begin(was_asleep, now);
-        // Any input may set an earlier deadline; one that becomes later is noticed in time.
+        // Any input may set an earlier deadline. A deadline that becomes later is noticed when the old one passes.
         match *input {
             Input::PortBytes { port, bytes } => self.port_bytes(port, bytes, now),
             Input::PortCan { port, ref frame } => self.port_can(port, frame, now),
             Input::PortSent { port } => self.port_sent(port),
-            // A port is there while its connection is.
+            // Such a port is up while its connection is.
             Input::PortUp { port } | Input::PortDown { port } if self.has_connection(port) => {}
             Input::PortUp { port } => self.port_up(port),
             Input::PortDown { port } => self.port_down(port, now),
@@ -126,7 +127,7 @@ impl EngineView<'_> {
         self.end(was_asleep)
     }
 
-    /// The next output, if something may have one.
+    /// The next output.
     pub(crate) fn poll_work<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         self.clock.idle_until = Instant::ZERO;
         let now = self.clock.forward(now);
@@ -134,7 +135,7 @@ impl EngineView<'_> {
             self.clock.dirty.add(Dirty::ALL);
         }
         if self.clock.dirty.has(Dirty::LINKS) && !self.clock.is_overdue {
-            // To send a command, a connection may have to be closed first.
+            // A connection may have to be closed before a command can be sent.
             self.clock.dirty.add(Dirty::ACTIONS.when(!self.links.command.is_empty()));
             self.store.now = now;
             let upward = self.links.next_upward(&mut self.clock.dirty, self.store, &mut buf[..]);
@@ -145,7 +146,7 @@ impl EngineView<'_> {
                 self.tap.went(TapPlace::Link(link), None, bytes, now);
                 return Output::LinkSend { link, bytes };
             }
-            // Commands that stop the robot are checked in every call, even before their deadline.
+            // Commands that stop the robot are checked in every call, even before a deadline.
             self.clock.dirty.remove(Dirty::LINKS);
             self.clock.dirty.add(Dirty::LINKS.when(self.links.has_stops()));
         }
@@ -193,7 +194,7 @@ impl EngineView<'_> {
         self.poll_sleep()
     }
 
-    /// Whether ports and links that are not asked really have no output.
+    /// For assertions: whether the ports and links that were not checked really have no output.
     pub(crate) fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
         self.links.next_upward(&mut { Dirty::ALL }, self.store, out).is_none()
             && self.links.next_action().is_none()
@@ -202,7 +203,7 @@ impl EngineView<'_> {
     }
 
     fn port_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) {
-        // After a sleep their age is unknown.
+        // After sleep the age of the bytes is unknown.
         if !self.clock.has_slept && hold(self.clock, self.ports, id, bytes, now).is_some() {
             return;
         }
@@ -231,13 +232,13 @@ impl EngineView<'_> {
         }
     }
 
-    /// The line was silent, which ends a device's frame. The timer is not armed.
+    /// The line was silent, which ends a device frame. The caller arms the timer.
     pub(crate) fn port_silent(&mut self, id: PortId, now: Instant) {
         if self.clock.has_slept {
-            // Nobody knows how long it has waited.
+            // The age of the partial frame is unknown.
             if let Some(port) = find_port(self.ports, id) {
                 port.discard_partial(self.tap, now);
-                // What is left of it ends with a silence that is counted from now on.
+                // What remains of the frame ends with a silence counted from now.
                 port.heard(&[], now);
             }
             return;
@@ -260,7 +261,7 @@ impl EngineView<'_> {
         }
         let accepted = port.can(frame, self.bindings.inputs, store, command, self.tap);
         if accepted.frames == 0 {
-            // Most are for other nodes of the bus.
+            // Most frames are for other nodes of the bus.
             return;
         }
         if let Some(deadline) = port.deadline_of_heard(&mut self.clock.dirty) {
@@ -307,7 +308,7 @@ impl EngineView<'_> {
         self.tell_alive(now);
     }
 
-    /// Drops commands whose device is gone.
+    /// Drops commands of devices that are gone.
     pub(crate) fn drop_forgotten(&mut self, now: Instant) {
         if let Some(command) = self.links.command.first_mut() {
             command.drop_forgotten(now);
@@ -326,7 +327,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// Passes the results of values and commands on a link on to their ports.
+    /// Reports dropped values and results of commands to their ports.
     pub(crate) fn carry_results(&mut self) {
         self.carry_outcomes();
         if self.store.take_has_lost() {
@@ -345,12 +346,12 @@ impl EngineView<'_> {
         });
     }
 
-    /// [`Self::after_frame`] in a copy of its own, for callers that can afford a call.
+    /// [`Self::after_frame`] out of line, for callers that can afford a call.
     pub(crate) fn after_field(&mut self, port: PortId, accepted: &Accepted, now: Instant) {
         self.after_frame(port, accepted, now);
     }
 
-    /// After a field frame: checks bits that trigger, and frames that wait for their neighbours.
+    /// After a field frame: checks trigger bits, and frames that wait for others.
     #[inline(always)]
     fn after_frame(&mut self, port: PortId, accepted: &Accepted, now: Instant) {
         if accepted.frames == 0 {
@@ -396,7 +397,7 @@ impl EngineView<'_> {
         }
     }
 
-    /// Values in the image changed: checks for rising bits that trigger.
+    /// Values in the image changed: checks for rising trigger bits.
     pub(crate) fn image_changed(&mut self) {
         if self.store.watches_bits {
             self.check_triggers();
@@ -419,7 +420,7 @@ impl EngineView<'_> {
         self.arm(first);
     }
 
-    /// The next output to the field.
+    /// The next frame to the field.
     fn next_downward(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
         let (image, bindings) = (&self.store.image, self.bindings.outputs());
         let mut left = self.ports.len();
@@ -429,7 +430,7 @@ impl EngineView<'_> {
                 && let Some(downward) = port.next_output(image, bindings, out, now)
             {
                 port.sender.take_due_since().record(now, &mut self.store.latency.lateness);
-                // Those before it had nothing.
+                // The ports before it had nothing to send.
                 if left == 0 && !port.sender.is_due() && !self.exchanges.is_used() {
                     self.clock.dirty.remove(Dirty::PORTS);
                 }

@@ -1,7 +1,7 @@
-//! Time: what a call says about it, deadlines that pass, and sleep of the gateway itself.
+//! Time: the present, passing deadlines, and sleep of the gateway itself.
 //!
-//! In: the instant of each call. Out: everything whose time has come, and when the engine has to be called again. Does not
-//! know what the deadlines are for.
+//! In: the instant of each call. Out: everything that is due, and when the engine has to be called again. Does not know
+//! what the deadlines are for.
 
 use super::EngineView;
 use crate::engine::clock::{AFTER_SLEEP, ASLEEP, Clock, Dirty, HEARTBEAT};
@@ -13,7 +13,8 @@ use crate::engine::link::links::LinksView;
 use crate::engine::values::store::{Overdue, Store};
 use crate::time::{Duration, Instant};
 
-/// When the engine has something to do without an input, computed exactly: without partial frames, and of these.
+/// The exact times at which the engine has something to do without an input: apart from partial frames, and for partial
+/// frames.
 pub(crate) fn deadlines(
     clock: &Clock,
     ports: &[FieldPort],
@@ -36,7 +37,7 @@ pub(crate) fn deadlines(
 }
 
 impl EngineView<'_> {
-    /// The deadlines up to `now` pass.
+    /// A tick: handles the deadlines up to `now`.
     pub(crate) fn tick(&mut self, now: Instant) {
         (self.clock.is_overdue, self.clock.announced) = (false, Instant::NEVER);
         self.clock.has_slept &= now < self.clock.slept_until;
@@ -45,14 +46,14 @@ impl EngineView<'_> {
         }
     }
 
-    /// Whether silence ends a partial frame; when it may, else.
+    /// Whether silence has ended a partial frame. If not, updates when it may.
     fn ends_partial(&mut self, now: Instant) -> bool {
         let first = self.ports.iter().map(FieldPort::partial_until).min();
         self.clock.partial_at = first.unwrap_or(Instant::NEVER);
         now >= self.clock.partial_at
     }
 
-    /// Nothing is to be done until the next deadline or beat.
+    /// Sleep until the next deadline or heartbeat.
     pub(crate) fn poll_sleep<'b>(&mut self) -> Output<'b> {
         if !self.clock.dirty.has(Dirty::ARMED) {
             self.clock.dirty.add(Dirty::ARMED);
@@ -63,7 +64,8 @@ impl EngineView<'_> {
         self.clock.sleep(!self.ports.is_empty())
     }
 
-    /// An input has come: the present. An engine that is asleep has nothing late, and no beat to look at.
+    /// Begins the handling of an input and returns the present. A sleeping engine has no overdue deadline or heartbeat
+    /// to check.
     pub(crate) fn begin(&mut self, was_asleep: bool, now: Instant) -> Instant {
         self.clock.idle_until = Instant::ZERO;
         if was_asleep {
@@ -76,7 +78,7 @@ impl EngineView<'_> {
         now
     }
 
-    /// It has been handled: whether the engine was asleep, and has nothing to do before it wakes.
+    /// Ends the handling of an input: asleep if the engine was and still has nothing to do before it wakes.
     pub(crate) fn end(&mut self, was_asleep: bool) -> Handled {
         if was_asleep
             && self.clock.dirty == Dirty::ARMED
@@ -88,12 +90,12 @@ impl EngineView<'_> {
         Handled::Poll
     }
 
-    /// The present, and whether the gateway has slept until now.
+    /// The present; also notices that the gateway has slept.
     fn present(&mut self, now: Instant) -> Instant {
         let now = self.clock.forward(now);
         self.store.now = now;
         if now >= self.clock.beat_at {
-            // A configured engine is called at every beat; before the first call nothing was late.
+            // A configured engine is called at every heartbeat; before the first call nothing was late.
             if self.clock.now != Instant::ZERO && now.saturating_since(self.clock.now) > ASLEEP {
                 self.wake(now);
             }
@@ -104,11 +106,11 @@ impl EngineView<'_> {
         now
     }
 
-    /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values
-    /// go first, no command is sent, and every connection is opened again.
+    /// The gateway itself slept: the age of everything that waits is unknown. Overdue safe values go first, no command
+    /// is sent, and every connection is reopened.
     fn wake(&mut self, now: Instant) {
         self.clock.sleeps = self.clock.sleeps.wrapping_add(1);
-        // Before deadlines pass: one of them may be to open a link that has been down.
+        // Before deadlines pass, because one of them may open a link that is down.
         self.links.slept(self.store);
         self.clock.has_slept = true;
         self.advance(now);
@@ -118,19 +120,18 @@ impl EngineView<'_> {
         self.arm(self.clock.slept_until);
     }
 
-    /// See [`Clock::arm`].
     pub(crate) fn arm(&mut self, at: Instant) {
         self.clock.arm(at);
     }
 
-    /// The driver ticks once more at this instant.
+    /// Asks the driver for another tick at the same instant.
     pub(crate) fn tick_again(&mut self) {
         self.clock.timer_at = self.clock.timer_at.min(self.clock.now);
     }
 
-    /// Handles everything that depends on the clock.
+    /// Handles everything that depends on the time.
     fn advance(&mut self, now: Instant) {
-        // At one instant the clock is checked once: what is done now is due later.
+        // The clock is checked once per instant: what is set now is due later.
         self.clock.timer_at = now + Duration::from_micros(1);
         self.clock.dirty.add(Dirty::ALL);
         self.clock.dirty.remove(Dirty::ARMED);
@@ -152,7 +153,7 @@ impl EngineView<'_> {
         self.carry_results();
     }
 
-    /// Reads the frames that silence has ended, of all ports that have one.
+    /// Reads the frames of all ports on which silence has ended one.
     fn read_ended(&mut self, now: Instant) {
         for index in 0..self.ports.len() {
             if let Some(port) = self.ports.get(index)
