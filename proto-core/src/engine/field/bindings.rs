@@ -12,8 +12,8 @@ use crate::sysvar::SysVar;
 use crate::time::Instant;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// How a field is written in a device's own frame: an [`Element`] without its constant, in half its
-/// size. There is one for every field of every port.
+/// How a field is encoded in a device frame: an [`Element`] without its constant, at half the size, because every field
+/// of every port has one.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Written {
     Value { encoding: Encoding, overflow: Overflow },
@@ -45,7 +45,7 @@ impl Written {
     }
 }
 
-/// An input field: what is done with its value, and how it is written in a device's own frame.
+/// An input field: where its value goes, and how it is encoded in a device frame.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct InputBind {
     pub to: InputTo,
@@ -71,42 +71,42 @@ impl InputBind {
     }
 }
 
-/// One word of a rule: what it is, and the halves of a number.
+/// One word of the rules of a field: its meaning, and a number or bits.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rule {
     pub is: Is,
-    /// As bytes, which need no alignment: a binding stays small.
+    /// As bytes, which need no alignment, to keep a binding small.
     bits: [u8; 8],
 }
 
-/// What a word is.
+/// The meaning of a word of a rule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Is {
     /// Scale and offset.
     Scale,
-    /// The variable has the number in two's complement.
+    /// The variable takes the number in two's complement.
     TwosComplement,
-    /// The lowest number; another one is rejected.
+    /// The lowest number; lower ones are rejected.
     Low,
-    /// The highest number.
+    /// The highest number; higher ones are rejected.
     High,
-    /// Another number becomes the nearest limit.
+    /// Numbers outside the limits become the nearest limit instead.
     Clamps,
-    /// The first value of an entry.
+    /// The first number of a map entry.
     First,
-    /// The last one.
+    /// The last number of a map entry.
     Last,
-    /// What the variable becomes for them.
+    /// The variable's value for numbers of the entry.
     Becomes,
-    /// What it becomes for all others.
+    /// The variable's value for all other numbers.
     Else,
-    /// A number that says that there is none.
+    /// A number that means "no value".
     NoNumber,
-    /// The same of a text of so many characters, eight in a word.
+    /// A text that means "no value": its length; each word holds eight characters.
     NoText(u8),
-    /// The digits have a comma for a point.
+    /// The digits have a decimal comma.
     Comma,
-    /// This variable, or these bits of it, tells whether a value was taken.
+    /// The variable, or bits of it, that shows whether a value was taken.
     ValidTo,
 }
 
@@ -123,18 +123,18 @@ impl Rule {
         f64::from_bits(self.bits())
     }
 
-    /// Its two halves.
+    /// The two halves of the bits.
     pub(crate) const fn halves(self) -> [u32; 2] {
         [self.bits().unbounded_shr(32) as u32, self.bits() as u32]
     }
 
     pub(crate) fn to_bind(self) -> InputBind {
-        // It is in no frame.
+        // A rule occupies no place in a frame.
         InputBind::new(InputTo::Rule(self), Element::Padding { len: 0, fill: 0 })
     }
 }
 
-/// What is done with the value of an input field.
+/// Where the value of an input field goes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum InputTo {
     Unused,
@@ -145,22 +145,22 @@ pub(crate) enum InputTo {
     },
     /// Index of a command field of the command link.
     Command(u8),
-    /// Bits of a byte variable: on unless the value is 0.
+    /// Bits of a byte variable: set unless the value is 0.
     Bits {
         var: SysVar,
         mask: u8,
     },
     /// Index of an alive counter.
     Counter(u8),
-    /// A variable, by the rules at these places behind the port's bindings.
+    /// A variable, by the rules at these places after the port's bindings.
     Ruled {
         var: SysVar,
         count: u8,
         first: u16,
     },
-    /// A part of these rules; no field of a frame.
+    /// A rule of such a field; not a field of a frame.
     Rule(Rule),
-    /// The halves of a constant, so that they need no more alignment than the others.
+    /// A constant in halves, so that it needs no stricter alignment than the other variants.
     Fixed {
         high: i32,
         low: u32,
@@ -168,7 +168,7 @@ pub(crate) enum InputTo {
 }
 
 impl InputTo {
-    /// The variable that the value becomes as a whole.
+    /// The variable that takes the value as a whole.
     pub(crate) const fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::Variable { var, .. } | Self::Ruled { var, .. } => Some(var),
@@ -176,8 +176,8 @@ impl InputTo {
         }
     }
 
-    /// The variable and the value that the received value becomes; `None` if the value does not fit
-    /// or the binding is not to a variable.
+    /// The variable and its new value for a received value; `None` if the value does not fit or the binding is not to a
+    /// variable.
     pub(crate) fn bound(&self, value: Scalar) -> Option<(SysVar, Scalar)> {
         match *self {
             Self::Variable { var, scale, offset } => {
@@ -196,8 +196,7 @@ pub(crate) fn fit(bindings: &[InputBind], values: impl Iterator<Item = Scalar>) 
     })
 }
 
-/// The frame with these fields is overdue: the next values pick no commands, unless the fields keep
-/// their base.
+/// The frame with these fields is overdue: the next values pick no commands, except in fields that keep their base.
 pub(crate) fn silence_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
@@ -207,7 +206,7 @@ pub(crate) fn silence_commands(bindings: &[InputBind], commands: Option<&mut Com
     }
 }
 
-/// The device is gone: the next values pick no commands; they only set the base.
+/// The device is gone: the next values pick no commands, they only set the base.
 pub(crate) fn forget_commands(bindings: &[InputBind], commands: Option<&mut CommandLink>, now: Instant) {
     let Some(link) = commands else { return };
     for binding in bindings {
@@ -217,16 +216,16 @@ pub(crate) fn forget_commands(bindings: &[InputBind], commands: Option<&mut Comm
     }
 }
 
-/// An output field: its type, the source of its value, and how it is written in a device's own
-/// frame. Packed, because there is room for many and the constant alone would align it.
+/// An output field: its type, the source of its value, and how it is encoded in a device frame. Packed, because there
+/// are many and the constant alone would raise the alignment.
 #[derive(Debug, Clone, Copy)]
 #[repr(C, packed(2))]
 pub(crate) struct OutputBind {
     pub from: OutputBinding,
     pub ty: ScalarType,
-    /// The place of its value among the image's extra values, if it is there.
+    /// The place of its value among the image's extra values, if it has one there.
     pub extra: u8,
-    /// Number of the limits or entries that say what it may send, and the first of them.
+    /// Number of limits or map entries that restrict what it may send, and the first of them.
     pub sendable: u8,
     pub first_sendable: u8,
     pub written: Written,
@@ -262,12 +261,12 @@ impl<'a> Outputs<'a> {
         Self { binds: span.of(self.binds), ..self }
     }
 
-    /// Whether a field of these may send only some numbers.
+    /// Whether one of these fields is restricted in what it may send.
     pub(crate) fn are_limited(self, span: Span) -> bool {
         !self.sendable.is_empty() && span.of(self.binds).iter().any(|bind| bind.sendable > 0)
     }
 
-    /// The number that is sent for `number`; not a number if none is.
+    /// The number to send for `number`; NaN if there is none.
     fn sent(self, binding: &OutputBind, number: f64) -> f64 {
         let allowed = self.sendable.iter().skip(usize::from(binding.first_sendable));
         let mut sent = f64::NAN;
@@ -287,7 +286,7 @@ impl<'a> Outputs<'a> {
 impl OutputBind {
     pub(crate) fn new(ty: ScalarType, from: OutputBinding, element: Element) -> Self {
         let from = match element {
-            // Exact: no constant has more than 53 bits.
+            // Exact: constants have at most 53 bits.
             Element::Fixed { value, .. } => OutputBinding::Constant(value as f64),
             _ => from,
         };
@@ -329,13 +328,13 @@ pub(crate) fn values(
             }
             OutputBinding::Bit { var, bit } => saturate_to_field(ty, image.bit(var, bit), 1.0, 0.0),
         };
-        // A part has no more fields than there is room for.
+        // Cannot fail: a part has at most `MAX_FIELDS` fields.
         let _ = values.push(value);
     }
     values
 }
 
-/// The number that a device's frame shows for a field of these; not a number if there is none.
+/// The number that a device frame shows for one of these fields; NaN if there is none.
 pub(crate) fn number_of(
     outputs: Outputs<'_>,
     binding: &OutputBind,
@@ -368,19 +367,18 @@ fn source_of(binding: &OutputBind, image: &Image, frames_sent: u32, reply: Reply
     }
 }
 
-/// A count as the field of a device's frame shows it: it never turns negative, nor stays at the
-/// highest number.
+/// A count as a field of a device frame: it wraps before it would turn negative or saturate.
 fn wrapping_number(binding: &OutputBind, count: f64) -> f64 {
     let high = binding.element().encoding().map_or(0.0, |encoding| encoding.range().1);
     wrap(count, 0.0, high.min(f64::from(u32::MAX))).unwrap_or(f64::NAN)
 }
 
-/// A count that goes from `max` to 0.
+/// A count that wraps to 0 after `max`.
 fn counted_to(count: u32, max: u32) -> u32 {
     max.checked_add(1).and_then(|numbers| count.checked_rem(numbers)).unwrap_or(count)
 }
 
-/// The bindings of all ports; ports name ranges of it.
+/// The bindings of all ports; ports refer to ranges of them.
 pub(crate) struct Bindings<'e> {
     pub inputs: &'e mut VecView<InputBind>,
     pub outputs: &'e mut VecView<OutputBind>,
@@ -393,7 +391,7 @@ impl Bindings<'_> {
         Outputs { binds: self.outputs, sendable: self.sendable }
     }
 
-    /// The output field that was added last may send this; `None` if there is no room.
+    /// Restricts the output field that was added last; `None` if there are too many restrictions.
     pub(crate) fn may_send(&mut self, sendable: Sendable) -> Option<()> {
         let first = self.sendable.len() as u8;
         let field = self.outputs.last_mut()?;

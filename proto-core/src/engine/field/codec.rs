@@ -1,4 +1,4 @@
-//! What a port knows of its recipe's frames, and what finds them in a stream.
+//! The frames of a port's recipe, and how they are found in a stream.
 
 use heapless::Vec;
 
@@ -10,11 +10,11 @@ use crate::modbus::rtu::Slave;
 use crate::recipe::{CanLayout, Deframer, StreamLayout};
 use crate::time::Instant;
 
-/// Maximum number of frames of one port with a device's own frames, both ways together.
+/// Maximum number of device frames of one port, input and output together.
 pub(crate) const MAX_DEVICE_FRAMES: usize = 18;
 
-/// The layouts of the port's recipe.
-// With a tag of its own: to find it in the values of a layout takes several instructions, each time.
+/// The layouts of a port's recipe.
+// With a tag of its own: a niche in a layout takes several instructions to read, each time.
 #[derive(Debug, Clone)]
 #[repr(u8)]
 #[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
@@ -24,7 +24,7 @@ pub(crate) enum Codec {
     Device(DeviceCodec),
 }
 
-/// The frames of a device, and what finds them in a stream.
+/// Device frames, and how they are found in a stream.
 #[derive(Debug, Clone)]
 pub(crate) struct DeviceCodec {
     /// The input frames, then the output frames.
@@ -32,22 +32,22 @@ pub(crate) struct DeviceCodec {
     pub inputs: u8,
     /// `None` on a CAN bus.
     pub reader: Option<Reader>,
-    /// What output frames are sent with.
+    /// The escaping of output frames.
     pub escape: Option<Escape>,
     pub texts: Vec<TextBind, MAX_TEXTS>,
-    /// Bytes outside whole frames that have been counted.
+    /// Bytes outside of frames that have already been counted.
     pub skipped_bytes: u32,
-    /// The line of the exchanges, if the recipe has any.
+    /// The exchanges of the port, if its recipe has any.
     pub line: Option<Line>,
 }
 
 impl DeviceCodec {
-    /// Whether silence has something to end.
+    /// Whether there is a partial frame that silence could end.
     pub(crate) fn has_begun(&self) -> bool {
         self.reader.as_ref().is_some_and(Reader::has_begun)
     }
 
-    /// Number of bindings of the input frames, and of the output frames.
+    /// Number of bindings of the input frames and of the output frames.
     pub(crate) fn fields(&self) -> (u16, u16) {
         let sum = |formats: &[DeviceFormat]| {
             formats.iter().map(|format| format.bindings.len).fold(0, u16::saturating_add)
@@ -68,26 +68,26 @@ impl DeviceCodec {
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
 pub(crate) enum Reader {
-    /// By their fields.
+    /// By their content.
     Search(Framer),
-    /// By what stands between them. `heard` is when the newest bytes came.
+    /// By delimiters or silence. `heard` is when the newest bytes arrived.
     Whole { cutter: Cutter, heard: Instant },
-    /// As the requests of a master.
+    /// As requests of a Modbus master.
     Slave(Slave),
 }
 
 impl Reader {
-    /// Whether silence has something to end.
+    /// Whether there is a partial frame that silence could end.
     pub(crate) fn has_begun(&self) -> bool {
         match self {
             Self::Search(framer) => !framer.held().is_empty(),
             Self::Whole { cutter, .. } => cutter.has_begun(),
-            // It has its own deadline.
+            // A slave has its own deadline.
             Self::Slave(_) => false,
         }
     }
 
-    /// The bytes of a frame that has begun.
+    /// The bytes of the partial frame.
     pub(crate) fn held(&self) -> &[u8] {
         match self {
             Self::Search(framer) => framer.held(),
@@ -96,7 +96,7 @@ impl Reader {
         }
     }
 
-    /// Drops them, and returns how many they were.
+    /// Discards the partial frame and returns its length.
     pub(crate) fn discard(&mut self) -> usize {
         match self {
             Self::Search(framer) => framer.discard(),

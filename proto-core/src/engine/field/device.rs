@@ -1,7 +1,8 @@
-//! The frames of a device that no recipe of the controller can describe: found, taken, and made.
+//! Device frames, which no recipe of the controller can describe: finds received ones, and makes those to send.
 //!
 //! In: bytes and CAN frames, and the port's bindings with their elements. Out: frames that were found, which
-//! `device_frame.rs` applies, and frames when they are due. Recipes of the controller's own kinds do not come here.
+//! `device_frame.rs` applies, and frames to send when they are due. Does not know the controller's own kinds of
+//! recipes.
 
 use heapless::Vec;
 
@@ -28,7 +29,7 @@ use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId, CanKey};
 
 impl DeviceCodec {
-    /// The frames of a recipe, whose bindings will begin at these places.
+    /// The frames of a recipe; the bindings of its inputs and outputs begin at these places.
     #[inline(never)]
     pub(crate) fn new(
         config: ConfigView<'_>,
@@ -87,7 +88,7 @@ impl DeviceCodec {
     }
 }
 
-/// A frame that was found, as one of these formats.
+/// The format of a frame that was found, with its number.
 type AsFormat<'f> = Result<(usize, &'f DeviceFormat), Rejection>;
 
 fn found_by_search<'f, 'b>(
@@ -120,7 +121,7 @@ fn found_whole<'f, 'b>(
 }
 
 impl FieldPort {
-    /// Reads the frames in `rest`, or the one that silence has ended if it is empty; see [`FieldPort::frames`].
+    /// Reads the frames in `rest`; if it is empty, the frame that silence has ended. See [`FieldPort::frames`].
     pub(crate) fn device_frames(
         &mut self,
         rest: &mut &[u8],
@@ -175,7 +176,7 @@ impl FieldPort {
                     let slot = usize::from(self.first_frame).saturating_add(nth);
                     frames.take_device(format, texts, frame, slot, &mut accepted)
                 }
-                // The search counts what is no frame, and these bytes are lost for the second time.
+                // The search already counts these bytes as discarded.
                 Err(why @ Rejection::NoFrame) => Err(why),
                 Err(why @ Rejection::Partial) => {
                     add(&mut frames.counters.discarded_bytes, frame.len());
@@ -185,7 +186,7 @@ impl FieldPort {
             };
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
-            // What is held can hold further frames, so only the rest of the chunk waits.
+            // The framer may hold more frames, so only the rest of the chunk is left for the next call.
             if verdict.is_ok() && frames.store.watches_bits && !left.is_empty() {
                 break;
             }
@@ -196,8 +197,8 @@ impl FieldPort {
         accepted
     }
 
-    /// Bytes that come when silence is overdue may have waited: nobody knows whether there was silence before them. What
-    /// had begun is discarded.
+    /// Bytes that come after silence should have ended a frame may have waited, so it is unknown whether there was
+    /// silence before them: discards the partial frame.
     fn discard_waiting(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
         if let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, heard }), .. }) = &self.codec
             && cutter.ends_by_silence()
@@ -209,7 +210,7 @@ impl FieldPort {
         }
     }
 
-    /// Counts what belongs to no frame, in these bytes or those held before.
+    /// Counts bytes that belong to no frame, in these bytes or those held before.
     pub(crate) fn note_skipped(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
         let Codec::Device(DeviceCodec { reader: Some(reader), skipped_bytes, .. }) = &mut self.codec else {
             return;
@@ -218,7 +219,7 @@ impl FieldPort {
             Reader::Search(framer) => {
                 let stats = framer.stats();
                 self.counters.resync_bytes = stats.skipped_bytes;
-                // The bytes of a frame with a wrong checksum were reported as that.
+                // The bytes of a frame with a wrong checksum were reported with that frame.
                 let noise = stats.noise_bytes.wrapping_sub(*skipped_bytes);
                 *skipped_bytes = stats.noise_bytes;
                 noise
@@ -236,7 +237,7 @@ impl FieldPort {
         }
     }
 
-    /// Whether silence ends frames on this port, and one has begun.
+    /// Whether silence ends frames on this port, and there is a partial frame.
     pub(crate) fn ends_by_silence(&self) -> bool {
         let Codec::Device(DeviceCodec { reader: Some(Reader::Whole { cutter, .. }), .. }) = &self.codec
         else {
@@ -258,7 +259,7 @@ impl FieldPort {
         cutter.discard();
     }
 
-    /// A frame from the bus; see [`FieldPort::can`].
+    /// Reads a CAN frame; see [`FieldPort::can`].
     pub(crate) fn device_can(
         &mut self,
         frame: &CanFrame,
@@ -287,7 +288,7 @@ impl FieldPort {
         Ok(())
     }
 
-    /// The frame of the device that is due.
+    /// The device frame that is due.
     pub(crate) fn next_device(
         &mut self,
         image: &Image,
@@ -306,7 +307,7 @@ impl FieldPort {
             let mut hash = DIGEST_SEED;
             for format in formats {
                 let Some(len) = encode(format, out) else {
-                    // What was sent last is still the newest. The frames of a cycle belong together.
+                    // The frame sent last is still the newest. The frames of a cycle belong together.
                     bump(&mut self.counters.stale_cycles);
                     self.sender.dismiss();
                     return None;

@@ -1,8 +1,9 @@
-//! Applying the frame of a device: field by field.
+//! Applies device frames field by field.
 //!
-//! In: a frame that was found, with its format. Out: values in the store, commands, and counters. A field whose value is not
-//! taken is rejected alone: its variable keeps its value and grows old on its own. A frame of which nothing is taken, and one
-//! with a wrong alive counter, is rejected as a whole (docs/engine.md section 11).
+//! In: a frame that was found, with its format. Out: values in the store, commands, and counters. A field whose value
+//! is not taken is rejected alone: its variable keeps its value and ages on its own. A frame of which nothing is taken,
+//! or with a wrong alive counter, is rejected as a whole (docs/engine.md section 11). Does not know how frames are
+//! found.
 
 use super::bindings::{InputBind, InputTo, Written};
 use super::format::{DeviceFormat, elements};
@@ -17,34 +18,34 @@ use crate::image::bind_to_variable;
 use crate::sysvar::SysVar;
 use crate::wire::scalar::Scalar;
 
-/// What is to become of a field.
+/// The verdict on a field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Verdict {
-    /// It has no value.
+    /// It is a field without a value, such as padding.
     Nothing,
     Taken,
-    /// The device says that it has none now.
+    /// The device says that it has no value now.
     NoValue,
     Rejected(Rejection),
 }
 
-/// The fields of a frame by what becomes of them.
+/// The fields of a frame, sorted by verdict.
 #[derive(Debug, Clone, Copy, Default)]
 struct Sorted {
     taken: FieldSet,
-    /// Without a value now, for whatever reason.
+    /// Fields without a value now, for whatever reason.
     without: FieldSet,
-    /// How many are rejected, and the first of them.
+    /// Number of rejected fields, and the first of them.
     rejected: usize,
     first: Option<FieldRejection>,
-    /// How many have no value, as the device says.
+    /// Number of fields for which the device says that it has no value.
     no_value: usize,
-    /// A variable tells whether one was taken.
+    /// A variable shows whether a field was taken.
     tells: bool,
 }
 
 impl FrameContext<'_> {
-    /// Applies a frame, and counts it in `accepted`.
+    /// Applies a frame and counts it in `accepted`.
     pub(crate) fn take_device(
         &mut self,
         format: &DeviceFormat,
@@ -56,7 +57,7 @@ impl FrameContext<'_> {
         if self.is_ignored(texts, format, frame) {
             bump(&mut self.counters.ignored);
             self.store.not_overdue(slot);
-            // Without variables; an answer to each frame is sent for this one, too.
+            // No variables are set, but an output that answers every frame answers this one, too.
             accepted.frames = accepted.frames.wrapping_add(1);
             return Ok(());
         }
@@ -73,7 +74,7 @@ impl FrameContext<'_> {
         Ok(())
     }
 
-    /// Applies what a master writes: as a whole or not at all, because it is told.
+    /// Applies what a master writes: as a whole or not at all, because the master gets one reply for all of it.
     pub(crate) fn take_block(
         &mut self,
         format: &DeviceFormat,
@@ -88,7 +89,7 @@ impl FrameContext<'_> {
         self.take_in_part(format, texts, data, slot, true, accepted)
     }
 
-    /// Whether all of a frame is taken.
+    /// Whether all fields of a frame are taken.
     fn is_whole(&self, format: &DeviceFormat, texts: &[TextBind], frame: &[u8]) -> bool {
         let bindings = format.bindings.of(self.bindings);
         let values = bindings.iter().zip(format.layout.values(elements(bindings), frame));
@@ -110,7 +111,7 @@ impl FrameContext<'_> {
         }) && self.texts(texts, format, frame).all(|(.., found)| found.is_ok())
     }
 
-    /// What becomes of the value of the `nth` field.
+    /// The verdict on the value of the `nth` field.
     fn verdict(
         &self,
         format: &DeviceFormat,
@@ -146,7 +147,7 @@ impl FrameContext<'_> {
         }
     }
 
-    /// What becomes of each field of a frame.
+    /// Sorts the fields of a frame by verdict.
     fn sort(&self, format: &DeviceFormat, texts: &[TextBind], frame: &[u8]) -> Sorted {
         let mut sorted = Sorted::default();
         let bindings = format.bindings.of(self.bindings);
@@ -197,7 +198,7 @@ impl FrameContext<'_> {
         sorted
     }
 
-    /// Applies a frame with fields that are not taken. `is_block` says that then nothing of it is.
+    /// Applies a frame with fields that are not taken. If `is_block`, a rejected field rejects all of it.
     fn take_in_part(
         &mut self,
         format: &DeviceFormat,
@@ -234,8 +235,8 @@ impl FrameContext<'_> {
         Ok(())
     }
 
-    /// Puts the values of a frame into their variables, and counts the frame; `sorted` says which are not taken, if not all
-    /// are.
+    /// Puts the values of a frame into their variables and counts the frame. `sorted` says which fields are not taken,
+    /// if any.
     fn apply(&mut self, format: &DeviceFormat, texts: &[TextBind], frame: &[u8], sorted: Option<&Sorted>) {
         let all = self.bindings;
         let bindings = format.bindings.of(all);
@@ -255,7 +256,7 @@ impl FrameContext<'_> {
             }
             match (bound(binding, value), binding.to) {
                 (Some((var, value)), _) => {
-                    // It fits, or it is of the field that does.
+                    // Cannot fail: the value fits, by `bound`.
                     let _ = self.store.image.set(var, value);
                 }
                 (None, InputTo::Counter(nth)) => {
@@ -295,8 +296,8 @@ impl FrameContext<'_> {
     }
 }
 
-/// The variable and the value that a field's value becomes; `None` if it does not fit, or is not for
-/// a variable.
+/// The variable and its new value for a field's value; `None` if the value does not fit, or the field is not for a
+/// variable.
 fn bound(binding: &InputBind, value: Scalar) -> Option<(SysVar, Scalar)> {
     let InputTo::Variable { var, scale, offset } = binding.to else { return None };
     let Written::Value { overflow: Overflow::Wrap, .. } = binding.written else {

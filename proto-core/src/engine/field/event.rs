@@ -1,10 +1,10 @@
-//! An event of an exchange: the bit that triggers it, how far it is, and what becomes of it (docs/engine.md section 13).
+//! An event of an exchange: the bit that triggers it, its progress and its outcome (docs/engine.md section 13).
 
 use super::peer_counters::EventCounters;
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 
-/// What became of an event, as the robot is told (docs/engine.md section 13).
+/// The outcome of an event, as reported to the robot (docs/engine.md section 13).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
@@ -14,15 +14,15 @@ pub enum Outcome {
     /// There was no event yet.
     #[default]
     None = 0,
-    /// It waits, or is on its way.
+    /// It waits to be sent, or for its reply.
     Open = 1,
     /// The device confirmed it.
     Done = 2,
     /// The device refused it.
     Refused = 3,
-    /// The device accepted it, and takes its time (Modbus exception 5).
+    /// The device accepted it and needs more time (Modbus exception 5).
     Accepted = 4,
-    /// It was sent, and no answer tells what became of it.
+    /// It was sent, but no reply tells whether it was executed.
     Unknown = 5,
     /// It could not be sent in time.
     Expired = 6,
@@ -32,11 +32,11 @@ pub enum Outcome {
     NoValue = 8,
     /// It was not sent: the device is away.
     Away = 9,
-    /// It was not sent: the event before it was still open.
+    /// It was not sent: the previous event was still open.
     StillOpen = 10,
-    /// It was not sent: a write that stops the device came first.
+    /// It was not sent: a write that stops the device took precedence.
     Stopped = 11,
-    /// It was not sent: the step before it was not done.
+    /// It was not sent: the previous step was not done.
     NotFollowed = 12,
 }
 
@@ -59,25 +59,25 @@ pub(crate) struct Reading {
 /// The event of an exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Event {
-    /// There is none.
+    /// No event is open.
     Over,
-    /// It happened at `at`, and newer values are pending.
+    /// The bit rose at `at`; newer values are pending.
     Risen { at: Instant, until: Instant },
-    /// Its request is made, and it follows an exchange that is not done yet.
+    /// Its request is made, and waits for the exchange that it follows.
     Behind { len: u16, until: Instant },
-    /// Its request is made.
+    /// Its request is made and may be sent.
     Ready { len: u16, until: Instant },
-    /// It is on its way.
+    /// Its request was sent.
     Sent { len: u16, until: Instant },
 }
 
-/// What is reported to the robot of an exchange's events.
+/// What is reported to the robot about an exchange's events.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct ReportedOutcome {
     pub outcome: Outcome,
-    /// With which code the device refused it.
+    /// The code with which the device refused it.
     pub code: u16,
-    /// Events that have ended, wrapping.
+    /// Number of events that have ended, wrapping.
     pub ended: u16,
 }
 
@@ -86,23 +86,23 @@ impl Trigger {
         Self { var, bit, last: None }
     }
 
-    /// The next reading is the first one.
+    /// Forgets the last reading, so that the next one is the first.
     pub(crate) const fn forget(&mut self) {
         self.last = None;
     }
 
-    /// Takes a reading over the connection that is up since then. Returns whether the bit has risen, for an event, and for
-    /// a write that stops, which does not need to know that it was 0.
+    /// Takes a reading over the connection that is up since `up_since`. Returns whether the bit has risen, for an
+    /// event, and for a write that stops, for which the bit need not have been read as 0 before.
     pub(crate) fn read(&mut self, reading: Reading, up_since: Instant, stale_after: Duration) -> [bool; 2] {
         let before = self.last.replace(reading);
         if !reading.on {
             return [false; 2];
         }
-        // By its time: what an earlier connection brought may be looked at again while this one is up.
+        // By its time, because a reading of an earlier connection may be checked again while this one is up.
         let before = before.filter(|before| before.at >= up_since);
         let was_off =
             before.is_some_and(|before| !before.on && reading.at.saturating_since(before.at) <= stale_after);
-        // What happened between two connections nobody knows.
+        // What happened between two connections is unknown.
         [was_off, !before.is_some_and(|before| before.on)]
     }
 }
@@ -112,7 +112,7 @@ impl Event {
         matches!(self, Self::Over)
     }
 
-    /// Whether it waits, and is not on its way.
+    /// Whether it waits to be sent.
     pub(crate) const fn waits(self) -> bool {
         matches!(self, Self::Risen { .. } | Self::Behind { .. } | Self::Ready { .. })
     }

@@ -1,10 +1,11 @@
-//! Events of exchanges: a bit that rises, and the steps that follow one (docs/engine.md section 13).
+//! Events of exchanges: a rising bit, and the steps that follow it (docs/engine.md section 13).
 //!
-//! In: readings of the bits, how requests ended, the time. Out: requests that are made once, with the values of the
-//! rise, and what became of each. A write that stops a peer is no event; it cancels those of its peer.
+//! In: readings of the bits, how requests ended, the time. Out: requests, each made once with the values at the rise,
+//! and their outcomes. A write that stops a peer is no event; it cancels the events of its peer. Does not know how
+//! requests are sent.
 //!
-//! A rise needs a 0 that was read before it over the same connection, and that is not stale. Values that are read apart
-//! from the bit come from a read that was answered after the one that showed the rise.
+//! A rise needs a 0 read before it over the same connection that is not stale. Values that are read separately from the
+//! bit must come from a read that was answered after the one that showed the rise.
 
 use super::event::{Event, Outcome, Reading};
 use super::exchanges::{ExchangeItem, Piece};
@@ -16,14 +17,14 @@ use crate::modbus::rtu::MAX_ADU;
 use crate::recipe::model::MAX_STREAM_FRAME;
 use crate::time::{Duration, Instant};
 
-/// What the values of requests are read from, as far as their age matters.
+/// Where the values of requests come from, as far as their age matters.
 pub(crate) struct Sources<C> {
-    /// Groups below this are frames of field ports.
+    /// Groups below this are frames of field ports, the others of links.
     pub first_of_links: u8,
-    /// Since when the connection is up over which a group's values come.
+    /// Since when the connection that brings a group's values is up.
     pub up_since: C,
     pub stale_after: Duration,
-    /// Whether the device of the port is there.
+    /// Whether the port's device is up.
     pub is_usable: bool,
 }
 
@@ -36,7 +37,7 @@ pub(crate) struct Events<'a, 't> {
 }
 
 impl Events<'_, '_> {
-    /// Values in the image have changed: looks at the bits, and makes the requests of events whose values are there.
+    /// Values in the image have changed: checks the bits, and makes the requests of events whose values are complete.
     pub(crate) fn image_changed(
         &mut self,
         maker: &Maker<'_>,
@@ -64,7 +65,7 @@ impl Events<'_, '_> {
         let up_since = maker.image.group(trigger.var).map_or(Instant::ZERO, &sources.up_since);
         let [rises, stops] = trigger.read(Reading { on, at }, up_since, sources.stale_after);
         if item.stops {
-            // Also while the device is away: it is a state.
+            // Even while the device is away, because a stop is a state.
             if stops {
                 self.stop(nth);
             }
@@ -73,7 +74,7 @@ impl Events<'_, '_> {
         }
     }
 
-    /// A write that stops its peer is wanted: it goes first, and what waits for the peer is cancelled.
+    /// A write that stops its peer is wanted: it goes first, and the peer's waiting events are cancelled.
     pub(crate) fn stop(&mut self, nth: usize) {
         self.line.request(self.table, nth, self.now);
         self.line.yield_to_stops(self.table, self.now);
@@ -90,11 +91,11 @@ impl Events<'_, '_> {
     fn rise(&mut self, nth: usize, at: Instant, is_usable: bool) {
         let Some(item) = self.items.get(nth) else { return };
         if !item.event.is_over() {
-            // The one before goes on; only the counter tells of this one.
+            // The open event goes on; only the counter shows this one.
             return self.count(nth, Outcome::StillOpen);
         }
         if item.follow.is_some() {
-            // The first step of the dialogue starts this one.
+            // Only the step before it starts this one.
             return;
         }
         let until = self.now + item.window;
@@ -123,7 +124,7 @@ impl Events<'_, '_> {
         }
     }
 
-    /// Makes the request of an event whose values are there, and those of all steps that follow it.
+    /// Makes the request of an event whose values are complete, and those of all steps that follow it.
     fn freeze(
         &mut self,
         nth: usize,
@@ -141,7 +142,7 @@ impl Events<'_, '_> {
             .and_then(|item| item.trigger)
             .and_then(|trigger| maker.image.group(trigger.var));
         let (mut steps, mut count) = ([nth as u8; MAX_STEPS], 1_usize);
-        // The steps behind it, the nearest first.
+        // The steps that follow, the nearest first.
         let mut done = 0_usize;
         while let Some(&step) = steps.get(done).filter(|_| done < count) {
             for (other, item) in (0..).zip(self.items.iter()) {
@@ -195,8 +196,8 @@ impl Events<'_, '_> {
         self.line.look(now);
     }
 
-    /// An exchange was answered, or ended without an answer: its event has ended, or may be sent again; the step behind
-    /// it is sent, or is not.
+    /// An exchange was answered, or ended without a reply: its event ends or may be sent again, and the next step is
+    /// sent or cancelled.
     pub(crate) fn ended(&mut self, nth: usize, is_event: bool, ended: Ended, code: u16) {
         let outcome = match ended {
             Ended::Good => Outcome::Done,
@@ -204,7 +205,7 @@ impl Events<'_, '_> {
             Ended::Accepted => Outcome::Accepted,
             Ended::Unclear | Ended::Unconfirmed => Outcome::Unknown,
             Ended::Busy if is_event => return self.busy(nth, code),
-            // It is asked again.
+            // The line repeats the request.
             Ended::Busy => return,
         };
         if is_event {
@@ -216,7 +217,7 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    /// The device has not done it, and may later.
+    /// The device was busy and did not execute it: it may be sent again.
     fn busy(&mut self, nth: usize, code: u16) {
         let Some(item) = self.items.get_mut(nth) else { return };
         let Event::Sent { len, until } = item.event else { return };
@@ -229,8 +230,8 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    /// The steps behind an exchange that is done. Those behind an event were made with it, unless they have ended since,
-    /// such as by a stop.
+    /// Starts the steps that follow an exchange that is done. Those that follow an event were made with it, unless they
+    /// have ended since, such as by a stop.
     fn follow(&mut self, nth: usize, is_event: bool) {
         let peer = self.table.rows.get(nth).map(|row| row.peer);
         let is_stopping = peer.is_some_and(|peer| self.is_stopping(peer));
@@ -245,7 +246,7 @@ impl Events<'_, '_> {
                     self.ready(other);
                 }
                 Event::Over if is_event => {}
-                // Its leader is no event: the step is one from now on.
+                // The exchange it follows is no event, so the step becomes one now.
                 Event::Over => {
                     self.open(other, Event::Risen { at: Instant::ZERO, until });
                     if is_stopping {
@@ -257,7 +258,7 @@ impl Events<'_, '_> {
         }
     }
 
-    /// An event has ended, and so have the steps behind it that wait, unless it was done.
+    /// Ends an event and, unless it was done, the waiting steps that follow it.
     pub(crate) fn end(&mut self, nth: usize, outcome: Outcome, code: u16) {
         let Some(item) = self.items.get_mut(nth) else { return };
         if item.event.is_over() {
@@ -272,7 +273,7 @@ impl Events<'_, '_> {
         if outcome == Outcome::Done {
             return;
         }
-        // No recursion: a step has one leader, so each is ended once.
+        // A loop instead of recursion: a step follows one exchange, so each is ended once.
         let mut left = self.items.len();
         while left > 0 {
             left = left.saturating_sub(1);
@@ -299,7 +300,7 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    /// What a failure or a sign of life means for the peer of an exchange.
+    /// Applies what a failure or a sign of life says about the peer of an exchange.
     pub(crate) fn note(&mut self, nth: usize, news: News) {
         let Some(which) = self.table.rows.get(nth).map(|row| row.peer) else { return };
         match news {
@@ -307,7 +308,7 @@ impl Events<'_, '_> {
             News::Away => self.end_waiting(Some(which), Outcome::Away),
             News::Started => {
                 for (item, row) in self.items.iter_mut().zip(self.table.rows.iter()) {
-                    // What it said before says nothing any more.
+                    // Its earlier replies no longer count.
                     if let Some(sign) = item.restart.as_mut().filter(|_| row.peer == which) {
                         sign.was_there = None;
                     }
@@ -326,7 +327,7 @@ impl Events<'_, '_> {
         }
     }
 
-    /// Ends all events of a peer that wait; of all peers with `None`.
+    /// Ends all waiting events of a peer, or of all peers with `None`.
     pub(crate) fn end_waiting(&mut self, peer: Option<u8>, outcome: Outcome) {
         for nth in 0..self.items.len() {
             let is_of_peer =
@@ -338,7 +339,7 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    /// Events whose time is over are not sent any more.
+    /// Ends waiting events whose time is over.
     pub(crate) fn expire(&mut self) {
         if self.now < self.line.expires_at {
             return;
@@ -358,5 +359,5 @@ impl Events<'_, '_> {
     }
 }
 
-/// The longest dialogue.
+/// The most steps of one event.
 const MAX_STEPS: usize = 16;

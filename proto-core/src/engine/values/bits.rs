@@ -1,13 +1,12 @@
 //! Bits with owners: several devices drive different bits of one byte variable.
 //!
-//! In: the frames' bits, as accepted; timeouts; what links have sent and lost. Out: which bits are to
-//! be written, with which values. Bits that nobody owns are never written by Modbus, and only as they
-//! were read back in frames of a recipe link (docs/engine.md section 5). The bits that one input
-//! frame writes in one byte are a *share*: they change, wait and grow old together.
+//! In: the bits of accepted frames; timeouts; what links have sent and lost. Out: which bits are to be written, with
+//! which values. Bits without an owner are never written by Modbus, and frames of a recipe link only repeat them as
+//! they were read back (docs/engine.md section 5). The bits that one input frame writes in one byte are a *share*: they
+//! change, wait and age together.
 //!
-//! The store's sets have such a byte where whole variables are: it is dirty, safe or unconfirmed if
-//! one of its bits is, and live if all are. It is never reachable, so plain frames, whose variables
-//! all are, do not come here.
+//! In the store's sets of whole variables such a byte is dirty, safe or unconfirmed if one of its bits is, and live if
+//! all are. It is never reachable, so plain frames, whose variables all are, do not come here.
 
 use heapless::Vec;
 
@@ -18,19 +17,19 @@ use crate::image::{BitSet, GroupId, Image, InputSet};
 use crate::sysvar::{INPUT_COUNT, SysVar, VarBit};
 use crate::time::{Duration, Instant};
 
-/// A safe value in the form of the image.
+/// A safe value in the encoding of the image.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SafeBytes {
     pub var: SysVar,
     pub bytes: [u8; 4],
-    /// The bits of a byte that it is for.
+    /// The bits of a byte that have this safe value.
     pub mask: u8,
 }
 
 impl SafeBytes {
     pub(crate) fn new(safe: &SafeValue) -> Self {
         let mut bytes = [0; 4];
-        // Every variable has at most four bytes, and validation has checked the type.
+        // Cannot fail: every variable has at most four bytes, and validation has checked the type.
         safe.value.encode(&mut bytes);
         Self { var: safe.var, bytes, mask: safe.mask }
     }
@@ -46,11 +45,12 @@ pub(crate) struct Share {
     pub mask: u8,
     /// Index of the frame in the store.
     pub frame: u8,
-    /// Index of its port in the engine.
+    /// Index of the frame's port in the engine.
     pub port: u8,
-    /// One more than the number of its group while a field of it is rejected; 0 if it has its frame's.
+    /// One more than the number of the share's group while a field of it is rejected; 0 if it belongs to its frame's
+    /// group.
     group: u8,
-    /// Since when the value that is written next has waited.
+    /// Since when the value to be written next has waited.
     at: Instant,
 }
 
@@ -59,12 +59,12 @@ impl Share {
         BitSet::of(self.var, self.mask)
     }
 
-    /// The group that it has the age of.
+    /// The group whose age the share has.
     pub(crate) fn group(&self) -> GroupId {
         self.withheld_in().unwrap_or(GroupId(self.frame))
     }
 
-    /// The group that it has while a field of it is rejected.
+    /// The group the share has while a field of it is rejected.
     fn withheld_in(&self) -> Option<GroupId> {
         self.group.checked_sub(1).map(GroupId)
     }
@@ -73,47 +73,46 @@ impl Share {
 #[derive(Debug, Clone)]
 pub(crate) struct Bits {
     shares: Vec<Share, MAX_SHARES>,
-    /// There are shares.
     pub is_used: bool,
-    /// The bytes that they are in.
+    /// The bytes that have shares.
     pub bytes: InputSet,
     /// Bits with a value to write.
     pub dirty: BitSet,
-    /// The value of each bit that is written next, or was written last.
+    /// The value of each bit to be written next, or written last.
     values: BitSet,
-    /// Bits with a value of their owner: received in time, or configured as safe.
+    /// Bits with a value of their owner: received in time, or a configured safe value.
     pub live: BitSet,
-    /// Bits at their safe value since their owner fell silent.
+    /// Bits at their safe value since their owner became overdue.
     pub safe: BitSet,
-    /// Those of them that the controller is not known to have.
+    /// Bits of `safe` that the controller is not known to have.
     pub unconfirmed: BitSet,
     /// Bits whose link is up.
     reachable: BitSet,
 }
 
-/// What became of a frame's bits.
+/// How a frame's bits were taken.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Offered {
     /// The bytes whose link is up.
     pub reachable: InputSet,
     /// A link is down.
     pub undelivered: bool,
-    /// Some of the bits had their safe value until now.
+    /// Some of the bits were at their safe value until now.
     pub was_safe: bool,
 }
 
-/// What a timeout did.
+/// The effect of a timeout.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TimedOut {
     /// Number of values that were dropped.
     pub dropped: usize,
-    /// A bit has taken its safe value.
+    /// A bit took its safe value.
     pub is_safe: bool,
-    /// Bytes with bits that hold: they are unknown until they are read back.
+    /// Bytes with bits that hold: their value is unknown until it is read back.
     pub held: InputSet,
 }
 
-/// Behind the places of variables in an edge queue.
+/// The place of a share in an edge queue, after those of variables.
 fn place(index: usize) -> u8 {
     INPUT_COUNT.saturating_add(index) as u8
 }
@@ -133,7 +132,7 @@ impl Bits {
         }
     }
 
-    /// An input frame writes this bit; `None` if there are too many shares.
+    /// Adds a bit that an input frame writes; `None` if there are too many shares.
     pub(crate) fn add(&mut self, bit: VarBit, frame: u8, port: u8) -> Option<()> {
         let mask = bit.mask().unwrap_or(0);
         let same = |share: &&mut Share| share.frame == frame && share.var == bit.var;
@@ -155,18 +154,18 @@ impl Bits {
         &self.shares
     }
 
-    /// The value of a byte as a recipe link writes it next.
+    /// The value of a byte as a recipe link would write it next.
     pub(crate) fn next_byte(&self, var: SysVar, image: &Image) -> u8 {
         let dirty = self.dirty.byte(var);
         image.byte(var) & !dirty | self.next_bits(var) & dirty
     }
 
-    /// The values of a byte's bits that are written next, or were written last.
+    /// The values of a byte's bits to be written next, or written last.
     pub(crate) fn next_bits(&self, var: SysVar) -> u8 {
         self.values.byte(var)
     }
 
-    /// A frame was accepted; its bits are in the image.
+    /// Takes the bits of an accepted frame; the image already has them.
     pub(crate) fn accepted(
         &mut self,
         frame: usize,
@@ -212,8 +211,8 @@ impl Bits {
         offered
     }
 
-    /// These bits have been handed over to their link: where all bits of a share have, the next value
-    /// in the queue takes their place.
+    /// These bits have been handed over to their link: a share with no dirty bit left takes its next value from the
+    /// queue.
     pub(crate) fn taken(&mut self, bits: BitSet, queues: &mut [EdgeQueue]) {
         self.dirty = self.dirty.minus(bits);
         for (nth, share) in self.shares.iter_mut().enumerate() {
@@ -230,8 +229,8 @@ impl Bits {
         }
     }
 
-    /// A group is overdue, that of a frame or of rejected fields: its bits take their safe values in place of everything
-    /// that waits. Bits without one hold.
+    /// The group of a frame or of rejected fields is overdue: its bits take their safe values in place of everything
+    /// that waits. Bits without a safe value hold.
     pub(crate) fn time_out(
         &mut self,
         group: GroupId,
@@ -253,7 +252,7 @@ impl Bits {
             }
             let waited = queue.drop_all(place(nth));
             let held = BitSet::of(var, share.mask & !mask);
-            // Without a value, there is nothing to hold.
+            // Bits without a value have nothing to hold.
             if !self.live.and(held).is_empty() {
                 let is_dirty = !self.dirty.and(held).is_empty();
                 done.dropped = done.dropped.saturating_add(waited).saturating_add(usize::from(is_dirty));
@@ -268,7 +267,7 @@ impl Bits {
                 self.dirty = self.dirty.or(own);
                 self.safe = self.safe.or(own);
                 self.unconfirmed = self.unconfirmed.or(own);
-                // Their owner may never have sent them.
+                // The owner may never have sent them.
                 self.live = self.live.or(own);
                 share.at = now;
                 done.is_safe = true;
@@ -282,7 +281,7 @@ impl Bits {
         self.shares.iter().filter_map(Share::withheld_in)
     }
 
-    /// Whether a frame has shares in these bytes that have its age.
+    /// Whether a frame has shares in these bytes that still have the frame's age.
     pub(crate) fn has_unwithheld(&self, frame: u8, bytes: &InputSet) -> bool {
         !bytes.is_empty()
             && self
@@ -291,7 +290,7 @@ impl Bits {
                 .any(|share| share.frame == frame && bytes.contains(share.var) && share.group == 0)
     }
 
-    /// The shares of a frame in these bytes have a group of their own, unless they had one.
+    /// Gives the shares of a frame in these bytes a group of their own, unless they have one.
     pub(crate) fn withhold(&mut self, frame: u8, bytes: &InputSet, group: GroupId) {
         for share in self.shares.iter_mut().filter(|share| share.frame == frame && bytes.contains(share.var))
         {
@@ -301,7 +300,7 @@ impl Bits {
         }
     }
 
-    /// The shares of a frame in these bytes have its age again.
+    /// Gives the shares of a frame in these bytes the frame's age again.
     pub(crate) fn readmit(&mut self, frame: u8, bytes: &InputSet) {
         for share in self.shares.iter_mut().filter(|share| share.frame == frame && bytes.contains(share.var))
         {
@@ -309,15 +308,15 @@ impl Bits {
         }
     }
 
-    /// The shares of one group have another one.
+    /// Moves the shares of one group to another.
     pub(crate) fn regroup(&mut self, from: GroupId, to: GroupId) {
         for share in self.shares.iter_mut().filter(|share| share.withheld_in() == Some(from)) {
             share.group = to.0.saturating_add(1);
         }
     }
 
-    /// Drops what has waited for longer than `timeout`; returns the number of values, and since when
-    /// the oldest remaining one waits.
+    /// Drops values that have waited for longer than `timeout`; returns their number, and since when the oldest
+    /// remaining one has waited.
     pub(crate) fn expire(
         &mut self,
         frame: usize,
@@ -356,8 +355,8 @@ impl Bits {
         self.reachable = self.reachable.or(BitSet::all_of(bytes));
     }
 
-    /// The link of these bytes was lost: what waits is dropped, except safe values. `count` gets the
-    /// number of values of a port.
+    /// The link of these bytes was lost: drops waiting values, except safe values, and counts them in the ports'
+    /// queues. Returns whether there were any.
     pub(crate) fn link_lost(&mut self, bytes: &InputSet, queues: &mut [EdgeQueue]) -> bool {
         self.reachable = self.reachable.minus(BitSet::all_of(bytes));
         let mut has_lost = false;
@@ -372,7 +371,7 @@ impl Bits {
         has_lost
     }
 
-    /// These safe values may not have arrived: they are written again, if they are still current.
+    /// These safe values may not have arrived: writes them again if they are still current.
     pub(crate) fn again(&mut self, bits: BitSet) {
         self.dirty = self.dirty.or(bits.and(self.safe));
     }

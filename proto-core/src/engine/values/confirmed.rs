@@ -1,8 +1,8 @@
-//! Whether the controller has the safe values: what confirms them, what casts unconfirm on them, and when they are
-//! written again.
+//! Whether the controller has the safe values: what confirms them, what makes them unconfirmed again, and when they are
+//! rewritten.
 //!
-//! In: values that the controller shows, answers of links, gaps in what it sends. Out: the safe values that are
-//! to be written once more.
+//! In: values that the controller shows, replies of links, gaps in what it sends. Out: the safe values to write once
+//! more.
 
 use super::store::Store;
 use crate::image::{BitSet, InputSet};
@@ -15,7 +15,7 @@ impl Store {
         self.unconfirmed.is_empty() && self.bits.unconfirmed.is_empty()
     }
 
-    /// A write of safe values failed: they are written again, if they are still current.
+    /// A write of safe values failed: writes them again if they are still current.
     pub(crate) fn again(&mut self, safe: &InputSet) {
         let safe = safe.and(&self.safe);
         self.outbox.again(&safe.minus(&self.bits.bytes));
@@ -25,13 +25,13 @@ impl Store {
         }
     }
 
-    /// The same for bits with owners.
+    /// Like [`Self::again`], for bits with owners.
     pub(crate) fn bits_again(&mut self, bits: BitSet) {
         self.bits.again(bits);
         self.bits_changed();
     }
 
-    /// The controller has these safe values, as far as they are still current.
+    /// The controller has these safe values; those no longer current are ignored.
     pub(crate) fn confirm(&mut self, safe: &InputSet) {
         if !safe.and(&self.unconfirmed).and(&self.unanswered).is_empty() {
             self.confirmed_at = self.now;
@@ -39,7 +39,7 @@ impl Store {
         self.unconfirmed = self.unconfirmed.minus(safe);
     }
 
-    /// The controller has these safe values of a byte's bits, as far as they are still current.
+    /// The controller has the safe values of these bits; those no longer current are ignored.
     pub(crate) fn confirm_bits(&mut self, var: SysVar, mask: u8) {
         let bits = BitSet::of(var, mask).and(self.bits.unconfirmed);
         if !bits.is_empty() && self.unanswered.contains(var) {
@@ -49,7 +49,7 @@ impl Store {
         self.bits_changed();
     }
 
-    /// Compares the safe values of a byte's bits with what the controller shows.
+    /// Compares the safe bits of a byte with what the controller shows.
     pub(crate) fn compare_bits(&mut self, var: SysVar, shown: u8, may_confirm: bool, may_unconfirm: bool) {
         let (safe, unconfirmed) = (self.bits.safe.byte(var), self.bits.unconfirmed.byte(var));
         let is_there = !(shown ^ self.image.byte(var));
@@ -63,20 +63,20 @@ impl Store {
         }
     }
 
-    /// Takes the bits of a byte that the controller shows and of which none of our own has a value.
+    /// Takes from what the controller shows the bits of a byte that have no value of their owner.
     pub(crate) fn show_bits(&mut self, var: SysVar, shown: u8) {
         let live = self.bits.live.byte(var);
         self.image.set_bits(var, var.valid_bits() & !live, shown);
         self.bits_changed();
     }
 
-    /// Whether the controller can have had this other value all along. Later another master has
-    /// written it.
+    /// Whether another value that the controller shows may have been there all along. Shown later, it was written by
+    /// another master.
     pub(crate) fn may_unconfirm(&self) -> bool {
         self.now < self.confirmed_at + CONFIRMED_FOR
     }
 
-    /// Outputs that have just arrived show another value than the safe one.
+    /// Outputs that have just arrived may show a value other than the safe one.
     pub(crate) fn unconfirm_by_witnesses(&mut self) {
         if !self.may_unconfirm() {
             return;
@@ -99,7 +99,7 @@ impl Store {
         }
     }
 
-    /// The controller does not have a safe value that a recipe link has sent.
+    /// The controller does not have a safe value that a recipe link sent.
     pub(crate) fn unconfirm(&mut self, var: SysVar) {
         if self.unanswered.contains(var) {
             self.unconfirmed.insert(var);
@@ -107,7 +107,7 @@ impl Store {
         }
     }
 
-    /// A state packet or a recipe frame came, which the controller sends steadily.
+    /// A state packet or a recipe frame arrived; the controller sends these steadily.
     pub(crate) fn heard(&mut self) {
         if !self.is_heard() {
             self.era = self.era.wrapping_add(1);
@@ -115,12 +115,12 @@ impl Store {
         self.heard_at = Some(self.now);
     }
 
-    /// Whether the controller has been there without a gap since the era began.
+    /// Whether the controller has been heard without a gap since the era began.
     pub(crate) fn is_heard(&self) -> bool {
         !is_gap(self.heard_at, self.now)
     }
 
-    /// The controller may have restarted: safe values are written once more.
+    /// The controller may have restarted: writes the safe values once more.
     pub(crate) fn controller_was_away(&mut self) {
         self.unconfirmed = self.safe;
         self.bits.unconfirmed = self.bits.safe;
@@ -129,8 +129,7 @@ impl Store {
         self.again(&safe);
     }
 
-    /// Whether a value that the controller shows now can be the result of the safe values, and not
-    /// older.
+    /// Whether a value that the controller shows now can be no older than the safe values.
     pub(crate) fn may_confirm(&self) -> bool {
         !self.unconfirmed.is_empty() && self.now >= self.unconfirmed_since + SHOWN_AFTER
     }
@@ -157,14 +156,13 @@ impl Store {
 
 /// A value shown sooner than this may be older than the safe value.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
-/// A packet of the state stream may be this late: a stream that is silent for 2 s is reopened.
+/// The longest delay of a state packet: a stream that is silent for 2 s is reopened.
 const CONFIRMED_FOR: Duration = Duration::from_secs(3);
 
 /// After this long without a state packet or recipe frame the controller may have restarted.
 const AWAY_AFTER: Duration = Duration::from_millis(500);
 
-/// Whether the newest packet or frame is so old, or none ever came, that the controller may have
-/// restarted.
+/// Whether the newest packet or frame is so old that the controller may have restarted, or none ever came.
 pub(crate) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
     last.is_none_or(|at| now.saturating_since(at) > AWAY_AFTER)
 }

@@ -1,8 +1,7 @@
 //! Alive counters in received frames: the number that goes up by one with every frame.
 //!
-//! In: the counters of frames that are right otherwise. Out: whether a frame is a repeat, which a
-//! frozen device sends, and whether frames between it and the one before are missing. One list for
-//! all ports, so that ports without counters take no room.
+//! In: the counters of otherwise valid frames. Out: whether a frame is a repeat, as a frozen device sends, and whether
+//! frames are missing before it. One list for all ports, so that ports without counters take no memory.
 
 use heapless::Vec;
 
@@ -12,15 +11,15 @@ use crate::wire::scalar::Scalar;
 /// Maximum number of counters in the input frames of all ports.
 pub(crate) const MAX_COUNTS: usize = 32;
 
-/// The counters of all ports; bindings name them by their index.
+/// The counters of all ports; bindings refer to them by index.
 #[derive(Debug, Clone)]
 pub(crate) struct Counts(Vec<Count, MAX_COUNTS>);
 
 #[derive(Debug, Clone, Copy)]
 struct Count {
-    /// What is followed by 0.
+    /// The highest number; 0 follows it.
     max: u32,
-    /// That of the newest accepted frame.
+    /// The number of the newest accepted frame.
     last: Option<u32>,
 }
 
@@ -29,14 +28,14 @@ impl Counts {
         Self(Vec::new())
     }
 
-    /// Adds a counter and returns its index; `None` if there is no room.
+    /// Adds a counter and returns its index; `None` if there are too many.
     pub(crate) fn add(&mut self, max: u32) -> Option<u8> {
         let nth = self.0.len() as u8;
         self.0.push(Count { max, last: None }).ok()?;
         Some(nth)
     }
 
-    /// Whether a frame with this number is a new one.
+    /// Whether a frame with this number is new.
     pub(crate) fn check(&self, nth: u8, number: Scalar) -> Result<(), Rejection> {
         let Some(count) = self.0.get(usize::from(nth)) else { return Ok(()) };
         match number.as_f64() {
@@ -46,7 +45,7 @@ impl Counts {
         }
     }
 
-    /// Takes the number of an accepted frame; returns whether it is not the next one.
+    /// Takes the number of an accepted frame; returns whether it is out of sequence.
     pub(crate) fn take(&mut self, nth: u8, number: Scalar) -> bool {
         let Some(count) = self.0.get_mut(usize::from(nth)) else { return false };
         let number = number.as_f64() as u32;

@@ -1,8 +1,8 @@
 //! Values that are still to be written to the controller.
 //!
-//! Analog values: the newest wins. Bits: every value that differs from the previous one is written,
-//! in order, through a bounded queue per port (docs/engine.md section 5). The outbox does not know
-//! links; the caller says which variables can be delivered.
+//! Analog values: the newest wins. Bits: every value that differs from the previous one is written, in order, through a
+//! bounded queue per port (docs/engine.md section 5). The outbox does not know links; the caller says which variables
+//! can be delivered.
 
 use heapless::Vec;
 
@@ -11,49 +11,48 @@ use crate::image::InputSet;
 use crate::sysvar::{BIT_INPUT_COUNT, SysVar};
 use crate::time::{Duration, Instant};
 
-/// Number of bit values per port that can wait behind the one that is written next.
+/// Number of bit values per port that can wait behind the next one to be written.
 const EDGE_QUEUE: usize = 16;
 
 #[derive(Debug, Clone, Copy)]
 struct Edge {
-    /// The ordinal of the variable, or the place of a share of bits behind those.
+    /// The ordinal of a byte variable, or the place of a share of bits after those.
     place: u8,
     value: u8,
     at: Instant,
 }
 
-/// The value of a byte variable that is written next, or was written last.
+/// The value of a byte variable to be written next, or written last.
 #[derive(Debug, Clone, Copy)]
 struct BitSlot {
     value: u8,
     at: Instant,
 }
 
-/// The values of one port that wait behind the next ones.
+/// The bit values of one port that wait behind the next ones.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct EdgeQueue {
     edges: Vec<Edge, EDGE_QUEUE>,
-    /// Number of the port's values that were dropped because a link was lost, until the port has counted them.
+    /// Number of values dropped because a link was lost and not yet counted at the port.
     pub lost: u32,
 }
 
-/// What becomes of a value for which another one waits already.
+/// How a value was queued behind one that already waits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Offer {
-    /// It replaces the value that is written next, which is the same.
+    /// It equals the value to be written next and takes its place.
     Next,
     /// It is in the queue.
     Queued,
     /// The queue was full: it replaced the newest value of its place.
     Lost {
-        /// That is the one which is written next.
+        /// The replaced value was the one to be written next.
         is_next: bool,
     },
 }
 
-/// The same for a share of bits; its next value is not here.
 impl EdgeQueue {
-    /// A new value of a place whose next one waits.
+    /// Offers a new value for a place whose next value waits.
     pub(crate) fn offer(&mut self, place: u8, next: u8, value: u8, now: Instant) -> Offer {
         let full = self.edges.is_full();
         match self.edges.iter_mut().rev().find(|edge| edge.place == place) {
@@ -68,7 +67,7 @@ impl EdgeQueue {
             None if next == value => Offer::Next,
             None if full => Offer::Lost { is_next: true },
             _ => {
-                // Cannot fail: it is not full.
+                // Cannot fail: the queue is not full.
                 let _ = self.edges.push(Edge { place, value, at: now });
                 Offer::Queued
             }
@@ -82,15 +81,15 @@ impl EdgeQueue {
         Some((edge.value, edge.at))
     }
 
-    /// Drops all values of a place; returns their number.
+    /// Drops all values of a place and returns their number.
     pub(crate) fn drop_all(&mut self, place: u8) -> usize {
         let before = self.edges.len();
         self.edges.retain(|edge| edge.place != place);
         before.saturating_sub(self.edges.len())
     }
 
-    /// Drops the values of a place that have waited for longer than `timeout`. Returns their number,
-    /// and since when the oldest remaining one waits.
+    /// Drops the values of a place that have waited for longer than `timeout`. Returns their number, and since when the
+    /// oldest remaining one has waited.
     pub(crate) fn expire(&mut self, place: u8, timeout: Duration, now: Instant) -> (usize, Instant) {
         let before = self.edges.len();
         self.edges.retain(|edge| edge.place != place || now.saturating_since(edge.at) <= timeout);
@@ -103,7 +102,7 @@ impl EdgeQueue {
 pub(crate) struct Outbox {
     /// Variables with a value to write.
     dirty: InputSet,
-    /// By ordinal: byte variables come first in the table.
+    /// By ordinal, because byte variables come first in the table.
     bits: [BitSlot; BIT_INPUT_COUNT],
 }
 
@@ -112,18 +111,17 @@ impl Outbox {
         Self { dirty: InputSet::EMPTY, bits: [BitSlot { value: 0, at: Instant::ZERO }; BIT_INPUT_COUNT] }
     }
 
-    /// Variables with a value to write.
     pub(crate) fn dirty(&self) -> InputSet {
         self.dirty
     }
 
-    /// The value of a byte variable that is to be written next.
+    /// The value of a byte variable to be written next.
     pub(crate) fn bit_value(&self, var: SysVar) -> u8 {
         self.bits.get(var.ordinal()).map_or(0, |slot| slot.value)
     }
 
-    /// A byte of whose bits each has its owner: whether one is to be written, and the whole byte as a
-    /// recipe link writes it next.
+    /// Sets a byte whose bits have owners: whether one is to be written, and the whole byte as a recipe link writes it
+    /// next.
     pub(crate) fn set_shared(&mut self, var: SysVar, is_dirty: bool, value: u8) {
         if let Some(slot) = self.bits.get_mut(var.ordinal()) {
             slot.value = value;
@@ -135,7 +133,7 @@ impl Outbox {
         }
     }
 
-    /// An accepted frame set a byte variable.
+    /// Takes the value that an accepted frame gave a byte variable.
     pub(crate) fn offer_bits(
         &mut self,
         queue: &mut EdgeQueue,
@@ -150,7 +148,7 @@ impl Outbox {
             self.dirty.insert(var);
             return;
         }
-        // A value of this variable is already waiting: only a value that differs is an edge.
+        // A value of this variable already waits: only a different value is an edge.
         let full = queue.edges.is_full();
         let place = var.ordinal() as u8;
         match queue.edges.iter_mut().rev().find(|edge| edge.place == place) {
@@ -165,19 +163,19 @@ impl Outbox {
                 bump(&mut counters.edges_lost);
             }
             _ => {
-                // Cannot fail: it is not full.
+                // Cannot fail: the queue is not full.
                 let _ = queue.edges.push(Edge { place, value, at: now });
             }
         }
     }
 
-    /// An accepted frame set variables that are not bits.
+    /// Takes the non-bit variables that an accepted frame has set.
     pub(crate) fn offer_analog(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.or(vars);
     }
 
-    /// The owner is silent: the variable takes its safe value, which replaces everything that
-    /// waits. `bits` is the safe value of a byte variable.
+    /// The owner is overdue: the variable's safe value replaces everything that waits. `bits` is the safe value of a
+    /// byte variable.
     pub(crate) fn offer_safe(&mut self, queue: &mut EdgeQueue, var: SysVar, bits: u8, now: Instant) {
         queue.edges.retain(|edge| usize::from(edge.place) != var.ordinal());
         if let Some(slot) = self.bits.get_mut(var.ordinal()) {
@@ -186,15 +184,15 @@ impl Outbox {
         self.dirty.insert(var);
     }
 
-    /// Writes again the values that were written last and may not have arrived.
+    /// Writes again values that may not have arrived.
     pub(crate) fn again(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.or(vars);
     }
 
-    /// Drops everything that is to be written of these variables; returns how many values waited.
+    /// Drops everything to be written of these variables; returns the number of dropped values.
     pub(crate) fn forget(&mut self, queue: &mut EdgeQueue, vars: &InputSet) -> usize {
         let before = queue.edges.len();
-        // Outputs have the places behind the inputs, and are in no set.
+        // The places of outputs come after those of inputs, and are in no set.
         queue
             .edges
             .retain(|edge| !SysVar::from_ordinal(edge.place.into()).is_some_and(|var| vars.contains(var)));
@@ -203,8 +201,8 @@ impl Outbox {
         before.saturating_sub(queue.edges.len()).saturating_add(dropped)
     }
 
-    /// Drops values that have waited for longer than `timeout`. Returns their number, and since
-    /// when the oldest remaining one waits.
+    /// Drops values that have waited for longer than `timeout`. Returns their number, and since when the oldest
+    /// remaining one has waited.
     pub(crate) fn expire(
         &mut self,
         queue: &mut EdgeQueue,
@@ -231,13 +229,12 @@ impl Outbox {
         (dropped, oldest)
     }
 
-    /// The variables' values have been handed over to their link.
+    /// These values have been handed over to their link.
     pub(crate) fn taken(&mut self, vars: &InputSet) {
         self.dirty = self.dirty.minus(vars);
     }
 
-    /// For byte variables whose value was taken: the next value in the queue takes its place, if
-    /// there is one.
+    /// Byte variables whose value was taken get their next value from the queue, if there is one.
     pub(crate) fn next_edges(&mut self, queue: &mut EdgeQueue, bits: &InputSet) {
         if queue.edges.is_empty() {
             return;
@@ -281,7 +278,7 @@ mod tests {
             self.outbox.offer_bits(&mut self.queue, &mut self.counters, var, value, self.now);
         }
 
-        /// All values that are written, one after the other.
+        /// All values that are written, in order.
         fn drain(&mut self, var: SysVar) -> std::vec::Vec<u8> {
             let mut written = std::vec::Vec::new();
             while self.outbox.dirty().contains(var) {

@@ -1,4 +1,4 @@
-//! A frame of which fields were rejected: its variables change groups.
+//! Frames with rejected fields: their variables change groups.
 
 use super::store::Store;
 use super::withheld::{FieldSet, WAITING, group_of, members};
@@ -6,8 +6,8 @@ use crate::image::GroupId;
 use crate::time::{Instant, Stamp};
 
 impl Store {
-    /// These fields of a frame that is accepted are rejected: from now on they grow old on their own. Whether there is room;
-    /// if not, nothing has changed.
+    /// Gives these rejected fields of an accepted frame an age of their own. False if there are too many groups;
+    /// nothing has changed then.
     pub(crate) fn withhold(&mut self, nth: usize, rejected: &FieldSet) -> bool {
         let now = self.now;
         let Some(frame) = self.frames.get_mut(nth) else { return false };
@@ -15,15 +15,15 @@ impl Store {
         let since = self.image.stamp_of(GroupId(id));
         let overdue_at = match since {
             Some(at) if frame.overdue_at != Instant::NEVER => at + frame.timeout,
-            // It was overdue together with its frame.
+            // The field became overdue together with its frame.
             Some(_) => Instant::NEVER,
             None if frame.overdue_at == Instant::ZERO => Instant::ZERO,
-            // It has never had a value; this is the first frame that should have brought one.
+            // The field never had a value; this is the first frame that should have brought one.
             None => now + frame.timeout,
         };
         let whole = rejected.whole.and(&frame.set).minus(&self.bits.bytes);
         let has_bits = self.bits.has_unwithheld(id, &rejected.bits);
-        // A command field without a value has no base that it could lose.
+        // A command field without a value has no base to lose.
         let has_commands = since.is_some() && overdue_at != Instant::NEVER;
         let is_command = move |(field, group): &(u32, &mut u8)| {
             has_commands && **group == 0 && rejected.commands.checked_shr(*field).unwrap_or(0) & 1 == 1
@@ -43,7 +43,7 @@ impl Store {
         true
     }
 
-    /// These fields of a frame are accepted, perhaps again: they have its age.
+    /// These fields of a frame are accepted, perhaps again: they get the frame's age.
     pub(crate) fn readmit(&mut self, nth: usize, taken: &FieldSet) {
         let Some(frame) = self.frames.get_mut(nth) else { return };
         let id = nth as u8;

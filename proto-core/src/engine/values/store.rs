@@ -1,5 +1,4 @@
-//! The state that the ports and links of one engine share: the image, the outbox, and for each
-//! field frame when it is overdue.
+//! The state that ports and links share: the image, the outbox, and when each field frame is overdue.
 
 use heapless::{Vec, VecView};
 
@@ -14,29 +13,26 @@ use crate::engine::rejection::FieldRejection;
 use crate::image::{BitSet, GroupId, Image, InputSet};
 use crate::time::{Duration, Instant, Stamp};
 
-/// Maximum number of input frames over all field ports: a stream recipe has one, a CAN recipe one
-/// per id.
+/// Maximum number of input frames over all field ports: a stream recipe has one, a CAN recipe one per id.
 pub(crate) const MAX_INPUT_FRAMES: usize = 48;
 
 /// One input frame of a device.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct InputFrame {
-    /// The variables it carries.
     pub set: InputSet,
     /// Index of the port in the engine.
     pub port: u8,
-    /// Its range of the user-defined bindings.
+    /// Its range in the user-defined bindings.
     pub bindings: Span,
-    /// When it is overdue; [`Instant::NEVER`] before the first one, and after it was overdue.
+    /// When it is overdue; [`Instant::NEVER`] before the first frame, and once it is overdue.
     pub overdue_at: Instant,
-    /// Its timeout.
     pub timeout: Duration,
-    /// Whether it is missed if it does not come; not a reply that is asked for only now and then.
+    /// Whether its absence counts; false for a reply that is requested only occasionally.
     pub is_expected: bool,
 }
 
 impl InputFrame {
-    /// Whether it is overdue or has never come.
+    /// Whether it is overdue or has never arrived.
     pub(crate) fn is_overdue(&self) -> bool {
         self.is_expected && self.overdue_at == Instant::NEVER
     }
@@ -51,7 +47,7 @@ pub(crate) enum Overdue {
     Fields(u8, usize),
     /// A rejected command field.
     Command(u8),
-    /// What the robot is told about the health of ports.
+    /// The variables of the health of ports, which are due.
     Health,
 }
 
@@ -59,54 +55,54 @@ pub(crate) enum Overdue {
 pub(crate) struct Store<Q: ?Sized = VecView<EdgeQueue>> {
     pub latency: Latency,
     pub counts: Counts,
-    /// The instant of this call of the engine.
+    /// The instant of the current call of the engine.
     pub now: Instant,
-    /// Some port sends on a rising bit, or shows the health of ports when it is asked, so the engine
-    /// checks the image after each frame, even if several came at once.
+    /// Some port sends on a rising bit, or shows the health of ports in replies, so the image is checked after each
+    /// frame, even if several arrive at once.
     pub watches_bits: bool,
     pub image: Image,
     pub outbox: Outbox,
-    /// Their indices are the frames' groups in the image.
+    /// Their indices are their groups in the image.
     pub frames: Vec<InputFrame, MAX_INPUT_FRAMES>,
-    /// Variables with a value of their owner: received in time, or configured as safe.
+    /// Variables with a value of their owner: received in time, or a configured safe value.
     pub live: InputSet,
-    /// Variables at their safe value since their owner fell silent.
+    /// Variables at their safe value since their owner became overdue.
     pub safe: InputSet,
-    /// Those of them that the controller is not known to have.
+    /// Variables of `safe` that the controller is not known to have.
     pub unconfirmed: InputSet,
-    /// When the newest of them was added, and when the newest was confirmed.
+    /// When a variable was last added to `unconfirmed`; `confirmed_at`: when one was last confirmed.
     pub unconfirmed_since: Instant,
     pub(crate) confirmed_at: Instant,
-    /// Variables written through recipe links, which do not answer.
+    /// Variables written through recipe links, which do not reply.
     pub unanswered: InputSet,
-    /// Variables that the state stream has brought since their owner fell silent, or at all.
+    /// Variables that the state stream has brought since their owner became overdue, or ever.
     pub read_back: InputSet,
-    /// Variables whose owner fell silent before its last value was handed over.
+    /// Variables whose owner became overdue before its last value was handed over.
     pub unsent: InputSet,
-    /// When the newest state packet or recipe frame came, which the controller sends steadily.
+    /// When the newest state packet or recipe frame arrived; the controller sends these steadily.
     pub(crate) heard_at: Option<Instant>,
-    /// Number of gaps in these, wrapping: the controller may have restarted in each.
+    /// Number of gaps between these, wrapping: the controller may have restarted in each.
     pub era: u32,
-    /// Variables whose link is up; none of whose bits each has an owner.
+    /// Variables whose link is up, except those whose bits have owners.
     pub reachable: InputSet,
-    /// Variables that are live, not safe and reachable, as a frame left them: the next one changes none of that. Some
-    /// may be missing.
+    /// Variables that are live, reachable and not safe, so that their next frame changes none of these sets. May lack
+    /// some.
     settled: InputSet,
-    /// Variables of whose bits each has its owner.
+    /// Variables whose bits have owners.
     pub bits: Bits,
-    /// Variables that tell the robot the health of ports.
+    /// Variables that report the health of ports to the robot.
     pub health: InputSet,
-    /// When they are checked again.
+    /// When the health of ports is checked again.
     health_at: Stamp,
     /// A queue has counted values that were lost with a link.
     has_lost: bool,
     /// No frame is overdue before this.
     pub(crate) next_overdue: Stamp,
-    /// No value has waited too long before this.
+    /// No waiting value expires before this.
     next_expiry: Stamp,
     /// Fields that are rejected while their frames are accepted.
     pub withheld: Withheld,
-    /// The newest field of the frame that was taken last that was rejected, until its port has noted it.
+    /// The first rejected field of the newest frame, until its port has noted it.
     pub rejected_field: Vec<FieldRejection, 1>,
     /// One queue per field port.
     pub edges: Q,
@@ -148,9 +144,8 @@ impl<Q> Store<Q> {
 }
 
 impl Store {
-    /// The values of an accepted frame are in the image: they are to be written. Returns those
-    /// whose link is up.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
+    /// The values of an accepted frame are in the image: queues them to be written. Returns those whose link is up.
+    // The cost is in docs/performance.md section 1, like that of the other attributes here.
     #[inline(always)]
     pub(crate) fn accepted(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         let now = self.now;
@@ -168,7 +163,7 @@ impl Store {
         set
     }
 
-    /// These variables have a value of their owner again. Whether the links of all are up.
+    /// These variables have a value of their owner again. Returns whether all are reachable.
     fn settle(&mut self, set: &InputSet) -> bool {
         self.live = self.live.or(set);
         if !self.safe.and(set).is_empty() {
@@ -184,14 +179,15 @@ impl Store {
         are_reachable
     }
 
-    /// A frame came and says nothing: its values stay as they are, and it is not overdue.
+    /// A frame arrived without a value: its variables keep theirs, and it is not overdue.
     pub(crate) fn not_overdue(&mut self, nth: usize) {
         let Some(frame) = self.frames.get_mut(nth) else { return };
         frame.overdue_at = self.now + frame.timeout;
         self.next_overdue.or_earlier(frame.overdue_at);
     }
 
-    /// The values of the newest frame may be as old as this: their age runs from the request that they could belong to.
+    /// The values of the newest frame may be as old as this: their age counts from the earliest request that they may
+    /// answer.
     pub(crate) fn was_asked(&mut self, nth: usize, since: Instant) {
         let group = GroupId(nth as u8);
         let Some(frame) = self.frames.get_mut(nth) else { return };
@@ -203,7 +199,7 @@ impl Store {
         self.next_overdue.or_earlier(frame.overdue_at);
     }
 
-    /// [`Self::accepted`] in a copy of its own, for callers that can afford a call.
+    /// [`Self::accepted`] out of line, for callers that can afford a call.
     pub(crate) fn accepted_apart(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         self.accepted(nth, counters)
     }
@@ -224,7 +220,7 @@ impl Store {
         }
     }
 
-    /// The same for a frame with variables whose link is down, or with bits that have owners.
+    /// [`Self::accepted`] for a frame with unreachable variables or with bits that have owners.
     #[cold]
     fn accepted_in_part(&mut self, nth: usize, counters: &mut PortCounters) -> InputSet {
         let Some(frame) = self.frames.get(nth) else { return InputSet::EMPTY };
@@ -234,7 +230,7 @@ impl Store {
         let whole = set.minus(&self.bits.bytes);
         let mut reachable = whole.and(&self.reachable);
         let mut undelivered = reachable != whole;
-        // A safe value that waits for the link is replaced: its owner is back.
+        // The owner is back, so a safe value that waits for the link is dropped.
         self.outbox.forget(queue, &whole.minus(&reachable));
         let mut bits = InputSet::EMPTY;
         if whole != set {
@@ -254,8 +250,7 @@ impl Store {
         reachable
     }
 
-    /// The bits with owners, or the image of their bytes, have changed: so do the bytes in the sets of
-    /// whole variables.
+    /// Bits with owners, or their bytes in the image, have changed: updates the sets of whole variables.
     pub(crate) fn bits_changed(&mut self) {
         for var in self.bits.bytes.iter() {
             let value = self.bits.next_byte(var, &self.image);
@@ -274,8 +269,8 @@ impl Store {
         }
     }
 
-    /// Handles the first thing overdue; the variables of a frame get their safe values. Call it again
-    /// until `None`.
+    /// Handles the first thing that is overdue; the variables of a frame take their safe values. Call it until it
+    /// returns `None`.
     pub(crate) fn next_timeout(&mut self, safe: &[SafeBytes]) -> Option<Overdue> {
         let now = self.now;
         if now < self.next_overdue.get() {
@@ -304,7 +299,7 @@ impl Store {
         frame.overdue_at = Instant::NEVER;
         let frame = *frame;
         if !is_from_start && self.image.stamp_of(GroupId(nth as u8)).is_none() {
-            // Its device only said that there is nothing to say: nothing was written yet.
+            // The device has only sent frames without a value so far: nothing was written.
             return Some(Overdue::Frame(frame, 0));
         }
         let dropped = self.time_out((GroupId(nth as u8), frame.port), &frame.set, safe);
@@ -322,7 +317,7 @@ impl Store {
         Some(Overdue::Fields(port, dropped))
     }
 
-    /// The variables of a group take their safe values or hold; returns how many waiting values were dropped.
+    /// The variables of a group take their safe values or hold. Returns how many waiting values were dropped.
     fn time_out(&mut self, (group, port): (GroupId, u8), set: &InputSet, safe: &[SafeBytes]) -> usize {
         let now = self.now;
         self.settled = self.settled.minus(set);
@@ -331,7 +326,7 @@ impl Store {
         for var in set.minus(&self.bits.bytes).iter() {
             let Some(value) = safe.iter().find(|safe| safe.var == var) else {
                 if !self.live.contains(var) {
-                    // It has never had a value.
+                    // It never had a value.
                     continue;
                 }
                 let waited = self.outbox.forget(queue, &InputSet::from_iter([var]));
@@ -349,7 +344,7 @@ impl Store {
                 *target = byte;
             }
             self.outbox.offer_safe(queue, var, value.bytes[0], now);
-            // Its owner may never have sent it.
+            // The owner may never have sent it.
             self.live.insert(var);
             self.safe.insert(var);
             self.unconfirmed.insert(var);
@@ -368,12 +363,12 @@ impl Store {
         dropped
     }
 
-    /// At the first tick, the frames that are overdue from the start are handled.
+    /// The frames that are overdue from the start are handled at the first tick.
     pub(crate) fn overdue_from_start(&mut self) {
         self.next_overdue = Stamp::at(Instant::ZERO);
     }
 
-    /// All frames whose devices are not silent yet are overdue at the next tick.
+    /// Makes all frames that are not overdue yet overdue at the next tick.
     pub(crate) fn all_overdue(&mut self) {
         for frame in self.frames.iter_mut().filter(|frame| frame.overdue_at != Instant::NEVER) {
             frame.overdue_at = Instant::ZERO;
@@ -382,20 +377,20 @@ impl Store {
         self.next_overdue = Stamp::at(Instant::ZERO);
     }
 
-    /// The health of ports is checked at this time.
+    /// Sets when the health of ports is checked next.
     pub(crate) fn check_health_at(&mut self, at: Instant) {
         self.health_at = Stamp::at(at);
         self.next_overdue.or_earlier(at);
     }
 
-    /// These variables of the health of ports have new values: they are written if their link is up,
-    /// else when it comes up.
+    /// These variables of the health of ports have new values: they are written at once if their link is up, else when
+    /// it comes up.
     pub(crate) fn tell(&mut self, vars: &InputSet) {
         self.live = self.live.or(vars);
         self.outbox.again(&vars.and(&self.reachable));
     }
 
-    /// Whether a value may have waited for longer than its port's timeout.
+    /// Whether a waiting value may have expired.
     pub(crate) fn may_expire(&self) -> bool {
         self.now >= self.next_expiry.get()
     }
@@ -411,7 +406,7 @@ impl Store {
             }
         }
         if self.withheld.is_used {
-            // Those whose time is over wait for nothing but their safe values.
+            // Groups that are overdue already only wait with their safe values.
             for (group, nth) in self.withheld.groups() {
                 if let Some(frame) = self.frames.get(usize::from(nth)).copied() {
                     let own = InputFrame { set: members(&self.image, group), ..frame };
@@ -424,7 +419,7 @@ impl Store {
         }
     }
 
-    /// The same of the variables of one group, the `nth` frame's or of rejected fields of it.
+    /// [`Self::expire_waiting`] for one group: that of the `nth` frame, or of rejected fields of it.
     fn expire_set(
         &mut self,
         (group, nth): (GroupId, usize),
@@ -446,7 +441,7 @@ impl Store {
             if !newest.is_empty()
                 && let Some(at) = self.image.stamp_of(group)
             {
-                // Frames that say nothing keep the device from being overdue, and its value waiting.
+                // Frames without a value keep the device from being overdue while its value waits.
                 if now.saturating_since(at) > frame.timeout {
                     dropped = self.outbox.forget(queue, &newest);
                 } else {
@@ -469,7 +464,7 @@ impl Store {
         }
     }
 
-    /// When something happens without an input.
+    /// When something is due without an input.
     pub(crate) fn deadline(&self) -> Instant {
         self.next_overdue.get().min(self.next_expiry.get())
     }
@@ -494,15 +489,15 @@ impl Store {
         self.bits_changed();
     }
 
-    /// A link came up: from now on frames are passed on to it. Earlier ones are not. The health of
-    /// ports is the present one.
+    /// A link came up: frames are passed on to it from now on, but no earlier ones. The health of ports is sent as it
+    /// is now.
     pub(crate) fn link_up(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.or(&vars.minus(&self.bits.bytes));
         self.outbox.again(&vars.and(&self.health).and(&self.live));
         self.bits.link_up(&vars.and(&self.bits.bytes));
     }
 
-    /// A link was lost: waiting values are dropped, except safe values.
+    /// A link was lost: drops waiting values, except safe values.
     pub(crate) fn link_lost(&mut self, vars: &InputSet) {
         self.reachable = self.reachable.minus(vars);
         self.settled = self.settled.minus(vars);
@@ -525,7 +520,7 @@ impl Store {
         self.bits_changed();
     }
 
-    /// The same for variables whose fields are rejected.
+    /// [`Self::link_lost`] for variables whose fields are rejected.
     fn withheld_lost(&mut self, vars: &InputSet) {
         for (group, nth) in self.withheld.groups() {
             let Some(port) = self.frames.get(usize::from(nth)).map(|frame| usize::from(frame.port)) else {
@@ -539,13 +534,13 @@ impl Store {
         }
     }
 
-    /// Whether queues have counted values that were lost with a link, since the last call.
+    /// Whether values have been lost with a link since the last call.
     pub(crate) fn take_has_lost(&mut self) -> bool {
         core::mem::take(&mut self.has_lost)
     }
 }
 
-/// When a value that has waited since `at` has waited longer than `timeout`.
+/// When a value that waits since `at` has waited for longer than `timeout`.
 fn too_old_at(at: Instant, timeout: Duration) -> Instant {
     at + timeout + Duration::from_micros(1)
 }

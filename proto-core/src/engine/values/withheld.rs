@@ -1,10 +1,10 @@
-//! Fields that are rejected while the rest of their frame is accepted (docs/engine.md section 11): each grows old on its
+//! Fields that are rejected while the rest of their frame is accepted (docs/engine.md section 11): each ages on its
 //! own, from its own last accepted value.
 //!
-//! In: which fields of an accepted frame were taken and which were not. Out: which variables, shares of bits and command
-//! fields are overdue. The variables of a rejected field leave the set of their frame and return to it with their next
-//! accepted value, so that frames that are accepted as a whole do not come here. Fields that were rejected at the same
-//! time after the same frame share a group.
+//! In: which fields of an accepted frame were taken and which were not. Out: which variables, shares of bits and
+//! command fields are overdue. The variables of a rejected field leave their frame's set and return with their next
+//! accepted value, so frames accepted as a whole do not come here. Fields rejected at the same time after the same
+//! frame share a group.
 
 use super::bits::Bits;
 use crate::image::{GroupId, Image, InputSet, MAX_GROUPS, WITHHELD_GROUPS};
@@ -13,11 +13,11 @@ use crate::time::{Instant, Stamp};
 /// Fields bound to command tables, over all ports.
 pub(crate) const MAX_COMMAND_FIELDS: usize = 16;
 
-/// Number of groups that still have their time.
+/// Number of groups for fields that are not overdue yet.
 pub(super) const WAITING: usize = WITHHELD_GROUPS - 2;
-/// The group of fields whose time is over and that have lost their own group to others: as old as the oldest of them.
+/// The group of overdue fields whose own group was reused: as old as the oldest of them.
 const LONG_AGO: GroupId = group_of(WAITING);
-/// The same of fields that have never had a value.
+/// Like `LONG_AGO`, for fields that never had a value.
 const UNKNOWN: GroupId = group_of(WAITING + 1);
 
 pub(super) const fn group_of(nth: usize) -> GroupId {
@@ -31,11 +31,11 @@ fn place_of(group: GroupId) -> Option<usize> {
 /// Fields of one frame.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct FieldSet {
-    /// The variables that they write as a whole.
+    /// Variables written as a whole.
     pub whole: InputSet,
-    /// The bytes of which they write bits.
+    /// Bytes in which bits are written.
     pub bits: InputSet,
-    /// The command fields, by their index.
+    /// Command fields, as a bit mask of their indices.
     pub commands: u16,
 }
 
@@ -51,16 +51,16 @@ impl FieldSet {
     }
 }
 
-/// All of them.
+/// The rejected fields of all frames.
 #[derive(Debug, Clone)]
 pub(crate) struct Withheld {
-    /// When each group is overdue; [`Instant::NEVER`] after that.
+    /// When each group is overdue; [`Instant::NEVER`] once it is.
     pub(super) overdue_at: [Stamp; WAITING],
     /// The frame of each group, by its index in the store.
     pub(super) frames: [u8; WAITING],
-    /// Of each command field that is rejected, one more than the number of its group; of others 0.
+    /// For each command field, one more than the number of its group while it is rejected, else 0.
     pub(super) commands: [u8; MAX_COMMAND_FIELDS],
-    /// Whether there is any.
+    /// Whether any field is rejected.
     pub is_used: bool,
 }
 
@@ -74,12 +74,12 @@ impl Withheld {
         }
     }
 
-    /// When the first of them is overdue.
+    /// When the first group is overdue.
     pub(crate) fn deadline(&self) -> Instant {
         self.overdue_at.iter().map(|at| at.get()).min().unwrap_or(Instant::NEVER)
     }
 
-    /// All that are not overdue yet are.
+    /// Makes all groups overdue that are not yet.
     pub(crate) fn all_overdue(&mut self) {
         let waiting = self.overdue_at.iter_mut().filter(|at| **at != Stamp::NEVER);
         waiting.for_each(|at| *at = Stamp::at(Instant::ZERO));
@@ -90,14 +90,14 @@ impl Withheld {
         (0..).map(group_of).zip(self.frames)
     }
 
-    /// The first group that is overdue, with its frame; it is not overdue any more.
+    /// Takes the first group that is overdue, with its frame.
     pub(crate) fn next_overdue(&mut self, now: Instant) -> Option<(GroupId, u8)> {
         let (nth, at) = self.overdue_at.iter_mut().enumerate().find(|(_, at)| at.get() <= now)?;
         *at = Stamp::NEVER;
         Some((group_of(nth), self.frames.get(nth).copied()?))
     }
 
-    /// A command field of a group that is overdue; it is not withheld any more.
+    /// Takes a command field of an overdue group; it is no longer withheld.
     pub(crate) fn next_command(&mut self, now: Instant) -> Option<u8> {
         let overdue_at = self.overdue_at;
         let is_overdue = |group: u8| {
@@ -114,8 +114,8 @@ impl Withheld {
         self.commands.iter().filter_map(|group| group.checked_sub(1)).map(GroupId)
     }
 
-    /// The group for fields of this frame whose last value came at `since`; `None` if all are in use by fields that still
-    /// have their time.
+    /// The group for fields of this frame whose last value arrived at `since`; `None` if all groups are in use by
+    /// fields that are not overdue yet.
     pub(super) fn group(
         &mut self,
         (frame, since): (u8, Option<Instant>),
@@ -142,7 +142,7 @@ impl Withheld {
         let group = match free {
             Some(group) => group,
             None => {
-                // Those whose time is over do not need to know when it began.
+                // Reuse a group that is overdue: it no longer needs its start.
                 let over = all().filter(|(((_, at), _), _)| *at == Stamp::NEVER);
                 let over = over.map(|(((group, _), _), _)| (image.stamp_of(group), group));
                 let (stamp, group) = over.min_by_key(|(stamp, _)| stamp.unwrap_or(Instant::ZERO))?;
