@@ -176,7 +176,7 @@ impl FieldPort {
                     let slot = usize::from(self.first_frame).saturating_add(nth);
                     frames.take_device(format, texts, frame, slot, &mut accepted)
                 }
-                // The search already counts these bytes as discarded.
+                // Not counted here: the search counts bytes that are no frame.
                 Err(why @ Rejection::NoFrame) => Err(why),
                 Err(why @ Rejection::Partial) => {
                     add(&mut frames.counters.discarded_bytes, frame.len());

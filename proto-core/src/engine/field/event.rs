@@ -30,7 +30,7 @@ pub enum Outcome {
     OutOfLimits = 7,
     /// It was not sent: a value is unknown or stale.
     NoValue = 8,
-    /// It was not sent: the device is away.
+    /// It was not sent: the device does not respond, or its port is down.
     Away = 9,
     /// It was not sent: the previous event was still open.
     StillOpen = 10,

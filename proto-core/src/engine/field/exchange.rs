@@ -1,8 +1,7 @@
-//! Exchanges on field ports: requests out, replies in, and what happens without them.
+//! Exchanges on field ports: requests, their replies, and missing replies.
 //!
-//! In: bytes and CAN frames of ports whose recipe has exchanges, the time. Out: values in the store,
-//! and requests. Which exchange is next is the line's business ([`super::line`]); ports without
-//! exchanges do not come here.
+//! In: bytes and CAN frames of ports whose recipe has exchanges, the time. Out: values in the store, and requests. Does
+//! not know which exchange is next ([`super::line`] does).
 
 use super::bindings::{InputBind, Outputs};
 use super::codec::{Codec, DeviceCodec, Reader};
@@ -49,12 +48,12 @@ impl FieldPort {
         matches!(&self.codec, Codec::Device(device) if device.reader.is_none())
     }
 
-    /// When its exchanges have something to do without an input.
+    /// When the port's exchanges have something to do without an input.
     pub(crate) fn exchange_deadline(&self) -> Instant {
         match self.line() {
             Some(line) if self.is_usable() => {
                 let deadline = line.deadline(&self.line);
-                // Until the line is free, there is only that to wait for.
+                // A request can only be sent once the line is free, which an input will report.
                 let own = if self.sender.is_busy() && line.may_ask() { Instant::NEVER } else { deadline };
                 own.min(line.expires_at).min(self.slave_deadline()).min(self.reply_deadline())
             }
@@ -62,7 +61,7 @@ impl FieldPort {
         }
     }
 
-    /// Whether the gateway is the slave of a line, which takes its bytes.
+    /// Takes the bytes if the gateway is the slave of this line; returns whether it is.
     pub(crate) fn hears_master(&mut self, bytes: &[u8], now: Instant) -> bool {
         let is_usable = self.is_usable();
         let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec else {
@@ -71,19 +70,18 @@ impl FieldPort {
         if is_usable {
             slave.received(bytes, now);
         } else {
-            // When the port is back, nobody waits for an answer any more.
+            // When the port is back, no master waits for a reply any more.
             add(&mut self.counters.discarded_bytes, bytes.len());
         }
         true
     }
 
-    /// Whether a request has failed, and the tick that says so is still to come.
+    /// Whether a request has failed and the tick that handles it is still to come.
     pub(crate) fn has_failed(&self, now: Instant) -> bool {
         self.is_usable() && self.line().is_some_and(|line| line.failure(&self.line, now).is_some())
     }
 
-    /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
-    /// after each frame.
+    /// Reads the frames in `rest`; stops after the first accepted one if the image has to be checked after each frame.
     pub(crate) fn exchange_frames(
         &mut self,
         rest: &mut &[u8],
@@ -140,7 +138,7 @@ impl FieldPort {
                 }
                 (Found::Other(frame), None) => (frame, Err(Rejection::OtherDevice)),
                 (Found::Other(frame), Some(all)) => {
-                    // Nothing behind it can be read.
+                    // No later frame on this connection can be found.
                     (all.is_lost, left) = (true, &[]);
                     (frame, Err(Rejection::Malformed))
                 }
@@ -159,7 +157,7 @@ impl FieldPort {
             let before = accepted.frames;
             let taken = match heard {
                 Ok(heard) => take_heard(&mut frames, texts, heard, (flight, frame, answer), &mut accepted),
-                // The search counts it.
+                // Already counted by the search.
                 Err(why @ Rejection::NoFrame) => Taken::nothing(Err(why)),
                 Err(why) => Taken::nothing(frames.rejected(why)),
             };
@@ -169,7 +167,7 @@ impl FieldPort {
             }
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
             keep_why(&mut self.last_rejection, verdict, frames.store, None, frame);
-            // What is held can hold further frames, so only the rest of the chunk waits.
+            // The framer may hold more frames, so only the rest of the chunk is left for the next call.
             let may_change = verdict.is_ok() || accepted.frames != before;
             if may_change && frames.store.watches_bits && !left.is_empty() {
                 break;
@@ -181,7 +179,7 @@ impl FieldPort {
         accepted
     }
 
-    /// A frame from the bus.
+    /// Reads a CAN frame.
     pub(crate) fn exchange_frame(
         &mut self,
         frame: &CanFrame,
@@ -267,7 +265,7 @@ impl FieldPort {
         verdict
     }
 
-    /// The next request, if the line is free for one.
+    /// The next request, if the line is free.
     pub(crate) fn next_request(
         &mut self,
         image: &Image,
@@ -281,7 +279,7 @@ impl FieldPort {
         }
         let is_busy = self.sender.is_busy() || now < self.line.quiet_at();
         let Codec::Device(codec) = &mut self.codec else { return None };
-        // Apart from the rest of the codec, which makes the frames.
+        // Taken out, because the rest of the codec makes the frames.
         let mut line = codec.line.take()?;
         let (items, mut table, kept) = view.served(&line);
         let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
@@ -317,10 +315,10 @@ impl FieldPort {
         let Some(line) = self.line_mut() else { return };
         let (items, mut table) = view.of(line);
         let flight = line.flight();
-        // A bus is free for others while a reply is pending.
+        // On CAN others may send while a reply is pending.
         let is_pending = line.sent(&table, &timing, now);
         if let Some(flight) = flight.filter(|_| !is_pending) {
-            // Nobody says whether it was heard. What follows it is sent behind it.
+            // A request without a reply may not have been received. The steps that follow it are sent nevertheless.
             let nth = usize::from(flight.exchange);
             let mut events = Events { items, table: &mut table, line, now };
             if flight.cause == Cause::Event {
@@ -332,7 +330,7 @@ impl FieldPort {
         }
     }
 
-    /// Pauses end, replies that have not come fail, and events expire.
+    /// Handles what is due: ends pauses, fails missing replies and expires events.
     pub(crate) fn advance_exchange(&mut self, mut view: View<'_>, now: Instant) {
         let (timing, is_on_can) = (self.line, self.is_on_can());
         let Some(line) = self.line_mut() else { return };
@@ -354,7 +352,7 @@ impl FieldPort {
         if let Over::GivenUp(news) = over {
             events.note(nth, news);
         }
-        // A bus was not held while the reply was pending: a frame of the cycle may be on its way.
+        // On CAN the sender was not held while the reply was pending: a frame of the cycle may be in transmission.
         if !is_on_can {
             self.sender.sent();
         }
@@ -384,7 +382,7 @@ impl FieldPort {
         }
     }
 
-    /// Values in the image have changed: looks at the bits that ask.
+    /// Values in the image have changed: checks the bits that trigger requests.
     pub(crate) fn triggers(
         &mut self,
         image: &Image,
@@ -407,7 +405,7 @@ impl FieldPort {
 
     pub(crate) fn begin_exchange(&mut self, mut view: View<'_>, now: Instant) {
         if let Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. }) = &mut self.codec {
-            // What came while the line was not there is too old to be answered.
+            // What came while the line was down is too old to be answered.
             add(&mut self.counters.discarded_bytes, slave.discard());
         }
         let is_on_can = self.is_on_can();
@@ -422,7 +420,7 @@ impl FieldPort {
         }
         line.begin(&mut table, now);
         line.looks = line.looks.map(|grid| crate::schedule::Grid::starting_at(now, grid.period()));
-        // Nobody has said that the port was gone, and its reply is not pending any more.
+        // The port was not reported down before, and its reply is no longer pending.
         if was_waiting && !is_on_can {
             self.sender.sent();
         }
@@ -433,13 +431,13 @@ fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v Exc
     view.of(line).0.get(usize::from(nth))
 }
 
-/// What a frame says of the exchanges.
+/// What a frame says about the exchanges.
 #[derive(Clone, Copy)]
 enum Sign {
     Nothing,
-    /// The request on its way is answered, with the code of a refusal.
+    /// A reply to the request in flight, with the code of a refusal.
     Answer(Ended, u16),
-    /// Its peer is at it.
+    /// The peer is still processing the request.
     Pending,
     ReplyOrEcho,
     /// A late reply to an earlier request of this exchange, or its pending answer.
@@ -448,24 +446,24 @@ enum Sign {
         is_pending: bool,
     },
     Ambiguous,
-    /// A frame that nobody asked for, of this exchange.
+    /// An unsolicited frame, of this exchange if it belongs to one.
     Unasked(Option<u8>),
 }
 
-/// The answer in a frame.
+/// The reply in a frame.
 #[derive(Clone, Copy)]
 struct Answer<'f> {
-    /// The data of a Modbus frame, or the frame.
+    /// The data of a Modbus frame, else the whole frame.
     data: &'f [u8],
-    /// Of a refusal.
+    /// The code of a refusal.
     code: u16,
     is_modbus: bool,
-    /// Its transaction id tells to which of the requests it is the reply.
+    /// Over TCP, the transaction id tells which request the reply belongs to.
     is_tcp: bool,
 }
 
 impl<'f> Answer<'f> {
-    /// The answer in a frame that was found in a stream.
+    /// The reply in a frame from a stream.
     fn of(frame: &'f [u8], is_modbus: bool, is_tcp: bool) -> Self {
         if !is_modbus {
             return Self { data: frame, code: 0, is_modbus, is_tcp: false };
@@ -478,22 +476,22 @@ impl<'f> Answer<'f> {
     }
 }
 
-/// What became of a frame.
+/// How a frame was taken.
 struct Taken<'f> {
     verdict: Result<(), Rejection>,
     sign: Sign,
-    /// The exchange whose reply was taken, and its data.
+    /// The exchange whose reply was taken, and the reply's data.
     told: Option<(u8, &'f [u8])>,
 }
 
 impl Taken<'_> {
-    /// It says nothing of the exchanges.
+    /// A frame that says nothing about the exchanges.
     const fn nothing(verdict: Result<(), Rejection>) -> Self {
         Self { verdict, sign: Sign::Nothing, told: None }
     }
 }
 
-/// Takes the values of a frame that was told apart.
+/// Takes the values of a classified frame.
 fn take_heard<'f>(
     frames: &mut FrameContext<'_>,
     texts: &[TextBind],
@@ -513,7 +511,7 @@ fn take_heard<'f>(
             }
             (verdict, Sign::Answer(Ended::Good, 0))
         }
-        // A write was executed.
+        // A confirmed write.
         Heard::Reply(None) => (Ok(()), Sign::Answer(Ended::Good, 0)),
         Heard::ReplyOrEcho => (Ok(()), Sign::ReplyOrEcho),
         Heard::Pending(pending) => (take_other(frames, Some(pending), texts, frame, accepted), Sign::Pending),
@@ -532,7 +530,7 @@ fn take_heard<'f>(
     Taken { verdict, sign, told }
 }
 
-/// What a frame that was taken says of the exchanges. Returns whether the line waited for it.
+/// Applies what a frame says about the exchanges. Returns whether the line waited for it.
 fn heed(
     line: &mut Line,
     items: &mut [ExchangeItem],
@@ -548,7 +546,7 @@ fn heed(
     match (taken.sign, flight) {
         (Sign::Pending, Some(flight)) => goes_on(line, items, table, flight, now),
         (Sign::Answer(ended, code), Some(flight)) => {
-            // Of a repetition, two copies may be the replies to both requests.
+            // After a repetition, two identical frames may be the replies to both requests.
             let is_sure = !flight.is_repetition() && !is_outstanding(table, flight, now);
             if is_sure && (flight.may_be_echo || line.echo.is_some()) {
                 learn_echo(line, table, flight.may_be_echo, now);
@@ -563,7 +561,7 @@ fn heed(
     false
 }
 
-/// What a refusal means; on Modbus its code tells (docs/wire/modbus-rtu.md section 4).
+/// The meaning of a refusal; on Modbus its code decides (docs/wire/modbus-rtu.md section 4).
 const fn refused_with(code: u16, is_modbus: bool) -> Ended {
     match code {
         5 if is_modbus => Ended::Accepted,
@@ -573,7 +571,7 @@ const fn refused_with(code: u16, is_modbus: bool) -> Ended {
     }
 }
 
-/// The peer whose CANopen node says that it has booted: its object dictionary is asked with SDO in one of the exchanges.
+/// The peer whose CANopen node reports that it has booted: the node that an exchange accesses with SDO.
 fn booted_peer(items: &[ExchangeItem], table: &ExchangeTable<'_>, frame: &CanFrame) -> Option<u8> {
     let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (frame.id(), frame.data()) else { return None };
     let sdo = CanKey::of(CanId::Standard(id.wrapping_sub(0x100)));
@@ -582,7 +580,7 @@ fn booted_peer(items: &[ExchangeItem], table: &ExchangeTable<'_>, frame: &CanFra
     table.rows.get(nth).map(|row| row.peer)
 }
 
-/// The code of an SDO abort, the low half, if the frame is one for the request on its way.
+/// The low half of the abort code, if the frame is an SDO abort of the request in flight.
 fn sdo_abort(pending: &PendingReplies<'_>, frame: &CanFrame) -> Option<u16> {
     let multiplexer = pending.flight?.sdo?;
     let reply = pending.asked()?.reply.as_ref()?;
@@ -590,17 +588,18 @@ fn sdo_abort(pending: &PendingReplies<'_>, frame: &CanFrame) -> Option<u16> {
     (frame.key() == reply.format.key && [a, b, c] == multiplexer).then_some(u16::from_le_bytes([low, high]))
 }
 
-/// Whether a reply to an earlier request of the same exchange may still come.
+/// Whether a reply to an earlier request of the same exchange may still arrive.
 fn is_outstanding(table: &ExchangeTable<'_>, flight: Flight, now: Instant) -> bool {
     table.rows.get(usize::from(flight.exchange)).is_some_and(|row| row.is_outstanding(now))
 }
 
-/// Own bytes are heard, or are not: what was not confirmed for that reason is, or is written again.
+/// It is now known whether the line echoes: requests that were unconfirmed because of this are sent again if it does,
+/// and confirmed if not.
 fn learn_echo(line: &mut Line, table: &mut ExchangeTable<'_>, has_echo: bool, now: Instant) {
     if !line.learn_echo(has_echo) {
         return;
     }
-    // The answer to the request on its way tells what became of that.
+    // Not the request in flight: its own reply decides.
     let own = line.flight().map(|flight| usize::from(flight.exchange));
     for nth in (0..table.rows.len()).filter(|nth| Some(*nth) != own) {
         let Some(row) = table.rows.get_mut(nth) else { break };
@@ -611,7 +610,7 @@ fn learn_echo(line: &mut Line, table: &mut ExchangeTable<'_>, has_echo: bool, no
     }
 }
 
-/// The request on its way is answered: counts it at its port and peer, and tells the events.
+/// The request in flight is answered: counts the reply at its port and peer, and updates the events.
 fn answered(
     line: &mut Line,
     items: &mut [ExchangeItem],
@@ -640,7 +639,7 @@ fn answered(
     events.ended(nth, flight.cause == Cause::Event, ended, code);
 }
 
-/// The peer is at it, and there.
+/// The peer is still processing the request, so it is up.
 fn goes_on(
     line: &mut Line,
     items: &mut [ExchangeItem],
@@ -669,8 +668,8 @@ fn take_other(
     }
 }
 
-/// Looks in a reply that was taken for the number that tells that its peer has restarted: it has, if the reply before had
-/// another one there. What is asked at its start is asked again.
+/// Checks an accepted reply for the value that shows that the peer has restarted: it has if the previous reply had
+/// another value. Its start exchanges are repeated then.
 fn look_for_restart(
     line: &mut Line,
     items: &mut [ExchangeItem],
@@ -693,7 +692,7 @@ fn look_for_restart(
     let Some(which) = table.rows.get(nth).map(|row| row.peer) else { return };
     let own = line.flight().map(|flight| usize::from(flight.exchange)).filter(|own| *own == nth);
     line.turns(table, |turns| {
-        // What its failures say is one start with this.
+        // If its failures also show a restart, it is the same one.
         if turns.heard(which, own, now) != News::Started {
             turns.started(which, own, now);
         }
@@ -701,7 +700,7 @@ fn look_for_restart(
     has_restarted(line, items, table, (nth, which), now);
 }
 
-/// The peer of this exchange has said that it has restarted, and its turns know it.
+/// The peer of this exchange has reported a restart, which its turns already know.
 fn has_restarted(
     line: &mut Line,
     items: &mut [ExchangeItem],
@@ -712,11 +711,11 @@ fn has_restarted(
     line.look(now);
     let mut events = Events { items, table, line, now };
     events.note(nth, News::Started);
-    // What it was to do, it has forgotten.
+    // The peer has lost everything it was asked to do before.
     events.end_waiting(Some(which), Outcome::Away);
 }
 
-/// A frame that is no answer to the request on its way is a sign of life of its peer.
+/// A frame that is no reply to the request in flight shows that its peer is up.
 fn signs(
     line: &mut Line,
     items: &mut [ExchangeItem],
@@ -739,7 +738,7 @@ fn signs(
     {
         bump(&mut peer.counters.late_replies);
     }
-    // The peer has carried out what its late reply is to.
+    // A late reply shows that the peer has executed the request.
     let own = matches!(sign, Sign::Late { is_pending: false, .. }).then_some(nth);
     let news = line.turns(table, |turns| turns.heard(which, own, now));
     line.look(now);

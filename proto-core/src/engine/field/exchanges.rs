@@ -1,7 +1,7 @@
-//! The exchanges of all ports: their frames, their turns and what is known of their peers.
+//! The exchanges of all ports: their frames, their turns and the state of their peers.
 //!
-//! In: the exchanges of a configuration. Out: for each port with exchanges a [`Line`], and the frames
-//! that it sends and takes. One list for all ports, so that a port without exchanges takes no room.
+//! In: the exchanges of a configuration. Out: for each port with exchanges a [`Line`], and the frames it sends and
+//! receives. One list for all ports, so that a port without exchanges takes no memory.
 
 use core::num::NonZero;
 
@@ -16,19 +16,19 @@ use crate::modbus::rtu::{Operation, Table};
 use crate::time::Duration;
 use crate::wire::can::CanId;
 
-/// The exchanges of all ports; ports name ranges of them.
+/// The exchanges of all ports; ports refer to ranges of them.
 pub(crate) struct Exchanges<'e> {
     pub items: &'e mut VecView<ExchangeItem>,
     pub rows: &'e mut VecView<Row>,
     pub peers: &'e mut VecView<PeerState>,
-    /// What masters have written, and the requests of events.
+    /// Blocks that masters have written, and requests of events.
     pub written: &'e mut [Piece],
 }
 
-/// Bytes of a block that a master writes, or of the request of an event; each takes as many pieces as it needs.
+/// Part of a block that a master writes, or of the request of an event; each takes as many as it needs.
 pub(crate) type Piece = [u8; 32];
 
-/// The same, of any size.
+/// [`Exchanges`] as slices.
 pub(crate) struct View<'a> {
     items: &'a mut [ExchangeItem],
     rows: &'a mut [Row],
@@ -36,7 +36,7 @@ pub(crate) struct View<'a> {
     written: &'a mut [Piece],
 }
 
-/// What is asked, and what answers.
+/// One exchange: its request and its possible replies.
 #[derive(Debug, Clone)]
 pub(crate) struct ExchangeItem {
     pub asks: Asks,
@@ -44,28 +44,28 @@ pub(crate) struct ExchangeItem {
     pub reply: Option<InputFormat>,
     pub pending: Option<OtherFormat>,
     pub refusal: Option<OtherFormat>,
-    /// What in the reply tells that the peer has restarted.
+    /// The value in the reply that shows a restart of the peer.
     pub restart: Option<RestartSign>,
-    /// It is asked when a value of the request changes.
+    /// Sent when a value of the request changes.
     pub on_change: bool,
-    /// The bit whose rise asks it.
+    /// The bit whose rise sends it.
     pub trigger: Option<Trigger>,
     /// It stops its peer.
     pub stops: bool,
-    /// The exchange of the port after whose good answer it is sent.
+    /// The exchange of the port that it follows once that is done.
     pub follow: Option<u8>,
-    /// How long after an event its request may be sent.
+    /// How long after an event its request may still be sent.
     pub window: Duration,
     pub event: Event,
-    /// What the robot is told of its events, in which variables, and whether that is new.
+    /// What is reported to the robot about its events, in which variables, and whether that has changed.
     pub reported: ReportedOutcome,
     pub outcome: OutcomeTo,
     pub is_news: bool,
-    /// The newest request, to tell a change.
+    /// Digest of the newest request, to detect a change.
     pub digest: Option<NonZero<u64>>,
-    /// It was to be asked, and a value of it was unknown or stale.
+    /// It was due, but a value of it was unknown or stale.
     pub is_owed: bool,
-    /// Where a block that a master writes is kept, so that the master can read it; or the request of an event.
+    /// Where a block that a master writes is kept for reading back, or the request of an event.
     pub pieces: Span,
     /// A master has written it.
     pub is_written: bool,
@@ -74,15 +74,15 @@ pub(crate) struct ExchangeItem {
 /// How a request is made.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Asks {
-    /// As a master on Modbus; request and reply are the data in their frames.
+    /// As a Modbus master; request and reply are the data in their frames.
     Rtu { slave: u8, operation: Operation },
-    /// With a frame of the device's own.
+    /// With a device frame.
     Frame,
-    /// With a remote frame on a CAN bus, which says how long the reply is.
+    /// With a remote frame on a CAN bus, which has the length of the reply.
     Remote { id: CanId, len: u8 },
-    /// Not at all: a master asks, and these are registers or coils of ours.
+    /// Not at all: a master accesses these registers or coils of the gateway.
     Served { table: Table, address: u16, count: u16 },
-    /// Not at all: the reply comes unasked.
+    /// Not at all: the reply is unsolicited.
     Nothing,
 }
 
@@ -100,13 +100,13 @@ pub(crate) struct OtherFormat {
     pub slot: Option<u8>,
 }
 
-/// The number in a reply that tells that the peer has restarted.
+/// The value in a reply that shows that the peer has restarted.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RestartSign {
-    /// Its place among the elements of the reply.
+    /// The place of the value among the elements of the reply.
     pub element: u8,
     pub value: f64,
-    /// Whether the reply before had it; `None` if there was none since the peer started.
+    /// Whether the previous reply had it; `None` if there was none since the peer started.
     pub was_there: Option<bool>,
 }
 
@@ -135,7 +135,7 @@ impl View<'_> {
         (items, table)
     }
 
-    /// The same, and what masters have written on all ports.
+    /// Like [`Self::of`], with what masters have written on all ports.
     pub(crate) fn served(&mut self, line: &Line) -> (&mut [ExchangeItem], ExchangeTable<'_>, &mut [Piece]) {
         let range = |span: Span| {
             let start = usize::from(span.start);

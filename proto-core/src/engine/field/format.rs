@@ -1,6 +1,6 @@
-//! One frame of a device's own, and what received bytes are, seen as such frames.
+//! The format of a device frame, and matching of received bytes against formats.
 //!
-//! In: bytes or CAN data, and the bindings with a frame's elements. Out: a frame, or how far they are from one. Applies
+//! In: bytes or CAN data, and the bindings with a frame's elements. Out: a frame, or why there is none (yet). Applies
 //! nothing.
 
 use super::bindings::InputBind;
@@ -9,24 +9,24 @@ use crate::device::{Element, FrameLayout, Probe};
 use crate::engine::rejection::Rejection;
 use crate::wire::can::{CanFrame, CanKey};
 
-/// One frame of the device.
+/// The format of one device frame.
 #[derive(Debug, Clone)]
 pub(crate) struct DeviceFormat {
     pub layout: FrameLayout,
     /// Its id on a CAN bus.
     pub key: CanKey,
-    /// Its range of the bindings of its direction, which have its elements.
+    /// Its range in the bindings of its direction, which have its elements.
     pub bindings: Span,
 }
 
-/// What the bytes are, seen as any of the frames: a frame wins over more bytes that are needed, and
-/// these over a wrong checksum.
+/// Matches bytes against all formats: a frame takes precedence over a partial frame, and a partial frame over a wrong
+/// checksum.
 pub(crate) fn probe_all(formats: &[DeviceFormat], bindings: &[InputBind], bytes: &[u8]) -> Probe {
     let probes = formats.iter().map(|format| probe(format, bindings, bytes));
     probes.fold(Probe::No(0), better)
 }
 
-/// What bytes are that can be seen in two ways.
+/// The better of two matches of the same bytes.
 pub(crate) fn better(one: Probe, other: Probe) -> Probe {
     match (one, other) {
         (Probe::Frame(len), _) | (_, Probe::Frame(len)) => Probe::Frame(len),
@@ -42,7 +42,7 @@ pub(crate) fn probe(format: &DeviceFormat, bindings: &[InputBind], bytes: &[u8])
     format.layout.probe(elements(format.bindings.of(bindings)), bytes)
 }
 
-/// What a whole frame is.
+/// The format of a whole frame.
 pub(crate) fn judge<'f>(
     formats: &'f [DeviceFormat],
     bindings: &[InputBind],
@@ -59,7 +59,7 @@ pub(crate) fn judge<'f>(
             Probe::No(_) if (shortest..=longest).contains(&frame.len()) => Rejection::OtherDevice,
             Probe::No(_) | Probe::Partial(_) => Rejection::WrongLength,
         };
-        // What is nearest to a frame says most.
+        // The reason closest to a match is the most useful one.
         verdict = match (verdict, why) {
             (Rejection::Checksum, _) | (_, Rejection::Checksum) => Rejection::Checksum,
             (Rejection::OtherDevice, _) | (_, Rejection::OtherDevice) => Rejection::OtherDevice,
@@ -69,8 +69,7 @@ pub(crate) fn judge<'f>(
     Err(verdict)
 }
 
-/// The frame that CAN data with this id are, or why they are none: frames with one id differ in
-/// constants.
+/// The format of CAN data with this id, or why there is none: frames with the same id differ in constants.
 pub(crate) fn judge_can<'f, T>(
     formats: impl Iterator<Item = (T, &'f DeviceFormat)>,
     bindings: &[InputBind],
@@ -82,7 +81,7 @@ pub(crate) fn judge_can<'f, T>(
         let probe = format.layout.probe_whole(fields, frame.data());
         why = match (probe, why) {
             (Probe::Frame(_), _) => return Ok((what, format)),
-            // Right but for a constant: another one than this, whatever the others are.
+            // Valid except for a constant: another device's frame, whatever the other formats say.
             (Probe::Other(_), _) | (_, Rejection::OtherDevice) => Rejection::OtherDevice,
             (Probe::Wrong(_), _) | (_, Rejection::Checksum) => Rejection::Checksum,
             (Probe::No(_), _) if frame.data().len() == format.layout.lengths().0 => Rejection::OtherDevice,

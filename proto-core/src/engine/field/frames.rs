@@ -1,4 +1,4 @@
-//! Applying the frames that came from a field port: as a whole or not at all. Those of devices are applied field by field, in
+//! Applies frames of a field port as a whole or not at all. Device frames are applied field by field, in
 //! `device_frame.rs`.
 //!
 //! In: the payload of a frame that was found, with its layout. Out: values in the store, commands, and counters. Does
@@ -16,11 +16,11 @@ use crate::recipe::model::Mode;
 use crate::recipe::{Applied, CanFrameLayout, StreamLayout, ValueError, Values};
 use crate::wire::scalar::Scalar;
 
-/// The frames that were accepted in one call.
+/// The frames accepted in one call.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Accepted {
     pub frames: u32,
-    /// Those of their variables whose link is up.
+    /// Variables of the newest frame, those whose link is up.
     pub set: InputSet,
 }
 
@@ -36,7 +36,7 @@ pub(crate) struct FrameContext<'a> {
 }
 
 impl<'a> FrameContext<'a> {
-    // The parts of a port one by one: its codec is in use meanwhile.
+    // Takes the parts of a port one by one, because the port's codec is borrowed meanwhile.
     pub(crate) fn new(
         (port, mode): (PortId, Mode),
         reply: &'a mut ReplyCode,
@@ -50,7 +50,7 @@ impl<'a> FrameContext<'a> {
 }
 
 impl FrameContext<'_> {
-    /// Counts a rejection, and is one.
+    /// Counts a rejection and returns it.
     pub(crate) fn rejected(&mut self, why: Rejection) -> Result<(), Rejection> {
         let counters = &mut *self.counters;
         bump(match why {
@@ -69,7 +69,7 @@ impl FrameContext<'_> {
     }
 
     /// Applies a frame as a whole or not at all, and counts it in `accepted`.
-    // A result with the set in it would be copied byte by byte: its tag is one byte.
+    // Returning the set in the result would copy it byte by byte, because the result's tag is one byte.
     pub(crate) fn take(
         &mut self,
         layout: &impl InputLayout,
@@ -86,7 +86,7 @@ impl FrameContext<'_> {
                 }
                 Err(_) => return self.rejected(Rejection::NotFinite),
             },
-            // With a context of its own, so that the other mode's can stay in registers.
+            // With a context of its own, so that the one of the other mode can stay in registers.
             Mode::User => self.again().take_user(layout, payload, slot)?,
         }
         bump(&mut self.counters.frames_in);
@@ -108,7 +108,7 @@ impl FrameContext<'_> {
     }
 
     /// Applies the values of a user-defined frame, all or none.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
+    // The cost is in docs/performance.md section 1, like that of the other attributes here.
     #[inline(never)]
     fn take_user(&mut self, layout: &impl InputLayout, payload: &[u8], slot: usize) -> Result<(), Rejection> {
         if layout.check(payload).is_err() {
@@ -133,12 +133,12 @@ impl FrameContext<'_> {
             InputTo::Unused
             | InputTo::Fixed { .. }
             | InputTo::Counter(_)
-            // Only in frames of devices.
+            // Only in device frames.
             | InputTo::Ruled { .. }
             | InputTo::Rule(_) => {}
             InputTo::Variable { .. } => {
                 if let Some((var, value)) = binding.bound(value) {
-                    // It fits: all values were tried before the first was applied.
+                    // Cannot fail: all values were checked before the first was applied.
                     let _ = self.store.image.set(var, value);
                 }
             }
@@ -167,7 +167,7 @@ impl FrameContext<'_> {
     }
 }
 
-/// The operations of a frame's layout, stream or CAN.
+/// The operations of a frame's layout, for streams and CAN.
 pub(crate) trait InputLayout {
     fn apply(&self, payload: &[u8], image: &mut ImageBytes) -> Result<Applied, ValueError>;
     fn check(&self, payload: &[u8]) -> Result<(), ValueError>;

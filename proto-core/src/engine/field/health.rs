@@ -11,17 +11,17 @@ use crate::image::{GroupId, MAX_EXTRA};
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 
-/// What the robot is told is checked this often; [`PortValue::Alive`] is also told at once when it
-/// becomes 0.
+/// Health is checked for changes to report to the robot at this period; [`PortValue::Alive`] is also reported at once
+/// when it becomes 0.
 pub(crate) const CHECK_EVERY: Duration = Duration::from_millis(100);
-/// Unchanged values are told again this often: an unanswered write, another master or a restarted
-/// controller may have undone them.
+/// Period at which unchanged values are repeated: an unconfirmed write, another master or a restarted controller may
+/// have undone them.
 pub(crate) const REPEAT_EVERY: Duration = Duration::from_secs(1);
 
-/// Each value of each port.
+/// Every value of every port.
 const MOST: usize = MAX_PORTS * PortValue::NAMES.len();
 
-/// A value that an output field shows.
+/// A value of health that an output field shows.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Shown {
     pub of: Of,
@@ -29,7 +29,7 @@ pub(crate) struct Shown {
     pub extra: u8,
 }
 
-/// What it is.
+/// The source of a shown value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Of {
     /// The health of the port with this index in the engine.
@@ -38,22 +38,22 @@ pub(crate) enum Of {
     Link(LinkId),
 }
 
-/// A variable that shows the robot the health of a port.
+/// A variable that shows the health of a port to the robot.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HealthVariable {
     pub port: u8,
     pub value: PortValue,
     pub var: SysVar,
-    /// What it was when the variable was last set.
+    /// The value with which the variable was last set.
     pub last: Option<u32>,
 }
 
-/// What is shown to devices and to the robot of the ports' health.
+/// What is shown of the health of ports, to devices and to the robot.
 #[derive(Debug, Clone)]
 pub(crate) struct PortsHealth {
     pub shown: Vec<Shown, MAX_EXTRA>,
     pub variables: Vec<HealthVariable, MOST>,
-    /// Whether anything is reported to the robot: health, or what became of events.
+    /// Whether anything is reported to the robot: health, or outcomes of events.
     pub is_reported: bool,
     /// The group of the variables.
     pub group: GroupId,

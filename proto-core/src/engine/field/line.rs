@@ -1,7 +1,7 @@
-//! The exchanges of one line: which of them has it, and what the line waits for.
+//! The exchanges of one line: which one occupies it, and what the line waits for.
 //!
-//! In: requests that were handed over and have left, replies, the time. Out: the next exchange, and when to look
-//! again. Does not know frames.
+//! In: requests handed over and sent, replies, the time. Out: the next exchange, and when to check again. Does not know
+//! frames.
 
 use super::line_timing::LineTiming;
 use super::modbus_tcp::Transactions;
@@ -13,49 +13,49 @@ use crate::modbus::rtu::Expected;
 use crate::schedule::{Grid, Presence};
 use crate::time::{Duration, Instant};
 
-/// What a line is used for.
+/// The state of a line.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Phase {
-    /// The next exchange may have it.
+    /// Free for the next exchange.
     Idle,
     /// A request is to be repeated.
     Repeat(Flight),
     /// A request has been handed over.
     Sending(Flight),
-    /// Its reply is pending.
+    /// A request has been sent, and its reply is pending.
     Waiting(Flight),
-    /// It rests.
+    /// Pausing until this instant.
     Resting(Instant),
 }
 
-/// A request on its way.
+/// A request in flight.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Flight {
-    /// The exchange, counted from 0 on the port.
+    /// The index of the exchange on the port.
     pub exchange: u8,
     pub cause: Cause,
     /// Repetitions so far.
     repeated: u8,
-    /// When the first transmission left that had no reply in time; never before there is one.
+    /// When the first transmission without a timely reply left; [`Instant::NEVER`] if there is none.
     unanswered: Instant,
-    /// A reply with a wrong checksum came.
+    /// A reply with a wrong checksum arrived.
     pub is_wrong: bool,
-    /// One came to an earlier transmission: that, or noise.
+    /// A reply to an earlier transmission had a wrong checksum, or there was noise.
     was_wrong: bool,
-    /// What came is its reply, or its own echo.
+    /// A frame arrived that is either the reply or the request's echo.
     pub may_be_echo: bool,
-    /// The peer said that it is at it.
+    /// The peer reported that it is still processing the request.
     is_pending: bool,
-    /// Its reply could be taken for that to another request.
+    /// Its reply could be mistaken for the reply to another request.
     is_ambiguous: bool,
-    /// The reply of a Modbus slave.
+    /// The expected reply of a Modbus slave.
     pub expected: Option<Expected>,
-    /// Command, index and subindex of an SDO request.
+    /// Index and subindex of an SDO request.
     pub sdo: Option<[u8; 3]>,
-    /// Of its bytes.
+    /// Digest of the request.
     digest: u64,
     until: Instant,
-    /// Not even a pending answer is waited for longer.
+    /// Pending answers do not extend the timeout beyond this.
     latest: Instant,
 }
 
@@ -64,52 +64,52 @@ pub(crate) struct Flight {
 pub(crate) enum Failure {
     Timeout,
     Checksum,
-    /// All that came may have been its own echo.
+    /// Only a frame that may be the request's own echo arrived.
     Echo,
-    /// The peer said that it is at it, and nothing else; or a write that stops goes first.
+    /// The peer only reported that it is still processing the request, or a write that stops takes precedence.
     Pending,
 }
 
-/// What became of a request that failed.
+/// The consequence of a failed request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Over {
     /// It is repeated.
     Repeated,
-    /// It was given up.
+    /// It is given up.
     GivenUp(News),
-    /// Nobody knows: see [`Failure::Echo`].
+    /// It may have been executed: see [`Failure::Echo`].
     Unconfirmed,
 }
 
 /// The exchanges of one port.
 #[derive(Debug, Clone)]
 pub(crate) struct Line {
-    /// The port's range of the exchanges, and of the peers.
+    /// The port's ranges of the exchanges and of the peers.
     pub exchanges: Span,
     pub peers: Span,
     pub phase: Phase,
     run: u8,
-    /// Values that ask are looked at with this period, if there are any.
+    /// The grid on which values that trigger requests are checked, if there are any.
     pub looks: Option<Grid>,
-    /// No exchange is due before.
+    /// No exchange is due before this.
     look_at: Instant,
-    /// No event expires before.
+    /// No event expires before this.
     pub expires_at: Instant,
     /// When the newest request left.
     sent: Instant,
-    /// Whether own bytes are heard, as the file says.
+    /// The configuration's `echo`: whether the line echoes the gateway's own bytes.
     echo_setting: Echo,
-    /// The same as far as it is known: as the file says, or as it was learned.
+    /// Whether the line echoes, as configured or as learned; `None` if unknown.
     pub has_echo: Option<bool>,
-    /// The echo that is still to come, or may come.
+    /// The echo that is expected, or possible.
     pub echo: Option<OwnRequest>,
-    /// Frames come that nobody asked for.
+    /// Unsolicited frames may arrive.
     pub hears_unasked: bool,
-    /// Over Modbus TCP: which request a reply belongs to.
+    /// On Modbus TCP: assigns replies to requests.
     pub transactions: Option<Transactions>,
 }
 
-/// What tells the echo of a request from other bytes.
+/// Identifies the echo of a request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct OwnRequest {
     len: u16,
@@ -123,8 +123,8 @@ impl OwnRequest {
         Some(Self { len: request.len() as u16, first, hash: digest(DIGEST_SEED, request) })
     }
 
-    /// Whether bytes begin with the echo. Nothing else may come before it: a late reply has been on its way
-    /// when the request was sent.
+    /// Whether bytes begin with the echo. Nothing can come before it: a late reply would have been on the line while
+    /// the request was sent.
     pub(crate) fn probe(&self, bytes: &[u8]) -> Probe {
         let len = usize::from(self.len);
         match bytes.get(..len) {
@@ -148,12 +148,12 @@ impl Flight {
         self.repeated > 0
     }
 
-    /// Since when a reply to it could have been expected, if an earlier transmission had none in time.
+    /// When the first transmission without a timely reply left, if there was one: a reply may belong to any since.
     pub(crate) fn unanswered(&self) -> Option<Instant> {
         Some(self.unanswered).filter(|at| *at != Instant::NEVER)
     }
 
-    /// Whether a request with these bytes may follow those that had no reply: one that is confirmed late must not
+    /// Whether a request with these bytes may follow transmissions without a reply: a late confirmation must not
     /// confirm another value.
     pub(crate) fn may_repeat(&self, request: &[u8]) -> bool {
         self.repeated == 0 || self.digest == digest(DIGEST_SEED, request)
@@ -161,7 +161,7 @@ impl Flight {
 }
 
 impl ExchangeTable<'_> {
-    /// The peer that a request is to.
+    /// The peer of a request.
     pub(crate) fn peer_of(&mut self, flight: Flight) -> Option<&mut PeerState> {
         let peer = self.rows.get(usize::from(flight.exchange)).map_or(0, |row| row.peer);
         self.peers.get_mut(usize::from(peer))
@@ -191,7 +191,7 @@ impl Line {
         }
     }
 
-    /// Whether the next exchange may have the line.
+    /// Whether the line is free for an exchange, or values that trigger requests are to be checked.
     pub(crate) fn is_free(&self, now: Instant) -> bool {
         let looks = self.looks.as_ref().is_some_and(|grid| grid.next() <= now);
         match self.phase {
@@ -206,7 +206,7 @@ impl Line {
         matches!(self.phase, Phase::Idle | Phase::Repeat(_))
     }
 
-    /// The request on its way.
+    /// The request in flight.
     pub(crate) const fn flight(&self) -> Option<Flight> {
         match self.phase {
             Phase::Sending(flight) | Phase::Waiting(flight) => Some(flight),
@@ -214,7 +214,7 @@ impl Line {
         }
     }
 
-    /// The exchange whose request is on its way, or is to be repeated.
+    /// The request in flight, or the one to be repeated.
     pub(crate) const fn occupied_by(&self) -> Option<Flight> {
         match self.phase {
             Phase::Sending(flight) | Phase::Waiting(flight) | Phase::Repeat(flight) => Some(flight),
@@ -222,8 +222,8 @@ impl Line {
         }
     }
 
-    /// The exchange whose request is to be made now; `None` until the line is to be looked at again.
-    /// It has the line if [`Self::handed_over`] follows, else the next is asked for.
+    /// The exchange whose request is to be made now; `None` if there is none before `look_at`. The exchange occupies
+    /// the line if [`Self::handed_over`] follows, else call this again for the next.
     pub(crate) fn next(&mut self, table: &mut ExchangeTable<'_>, now: Instant) -> Option<Flight> {
         if let Phase::Repeat(flight) = self.phase {
             self.phase = Phase::Idle;
@@ -256,7 +256,7 @@ impl Line {
         }
     }
 
-    /// The request was handed over.
+    /// A request was handed over.
     pub(crate) fn handed_over(
         &mut self,
         table: &mut ExchangeTable<'_>,
@@ -286,7 +286,7 @@ impl Line {
         });
     }
 
-    /// It has left. Returns whether the line now waits for the reply.
+    /// The request has left. Returns whether the line now waits for the reply.
     pub(crate) fn sent(&mut self, table: &ExchangeTable<'_>, line: &LineTiming, now: Instant) -> bool {
         let Phase::Sending(flight) = self.phase else { return false };
         self.sent = now;
@@ -297,21 +297,21 @@ impl Line {
             let latest = until(|row| row.timeout().saturating_mul(LONGEST_PENDING));
             Phase::Waiting(Flight { until: until(Row::timeout), latest, ..flight })
         } else {
-            // Own bytes are not heard: the silence behind them is kept here.
+            // Without a reply there is nothing to hear, so the silence after the request is kept here.
             resting(until(Row::pause).max(now + line.turnaround), now)
         };
         self.look_at = now;
         is_answered
     }
 
-    /// A frame with a wrong checksum came: perhaps the reply.
+    /// A frame with a wrong checksum arrived, perhaps the reply.
     pub(crate) fn heard_wrong(&mut self) {
         if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
             flight.is_wrong = true;
         }
     }
 
-    /// What came is the reply, or the request's own echo: only what comes behind it can tell.
+    /// A frame arrived that is the reply or the request's echo: only what follows can tell.
     pub(crate) fn heard_reply_or_echo(&mut self) {
         if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
             flight.may_be_echo = true;
@@ -319,7 +319,8 @@ impl Line {
         self.echo = None;
     }
 
-    /// The peer is at it: its answer is pending anew, as if the request had left now. Writes that stop do not wait for it.
+    /// The peer is still processing the request: the timeout starts again, as if the request had left now. Writes that
+    /// stop do not wait for it.
     pub(crate) fn heard_pending(&mut self, table: &ExchangeTable<'_>, now: Instant) {
         if let Phase::Sending(flight) | Phase::Waiting(flight) = &mut self.phase {
             (flight.is_pending, flight.is_wrong) = (true, false);
@@ -332,7 +333,7 @@ impl Line {
         self.yield_to_stops(table, now);
     }
 
-    /// What is pending is not waited for beyond the turn of a write that stops.
+    /// A pending answer is not waited for any longer once a write that stops is due.
     pub(crate) fn yield_to_stops(&mut self, table: &ExchangeTable<'_>, now: Instant) {
         let Phase::Waiting(flight) = &mut self.phase else { return };
         if !flight.is_pending {
@@ -344,7 +345,7 @@ impl Line {
         }
     }
 
-    /// Own bytes are heard, or are not. Returns whether that is news.
+    /// The line is known to echo, or not to. Returns whether that is new.
     pub(crate) fn learn_echo(&mut self, has_echo: bool) -> bool {
         let is_news = self.has_echo.is_none();
         if is_news {
@@ -353,8 +354,7 @@ impl Line {
         is_news
     }
 
-    /// The peer has answered. What it says counts for nothing where the answer could be another request's: that is
-    /// [`Ended::Unclear`].
+    /// The peer has answered. If the reply may belong to another request it proves nothing: [`Ended::Unclear`].
     pub(crate) fn answered(
         &mut self,
         table: &mut ExchangeTable<'_>,
@@ -363,10 +363,11 @@ impl Line {
         now: Instant,
     ) -> (Ended, News) {
         let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
-        // The reply may be a late one to the first of the requests. Then that to the repetition is still to come.
+        // The reply may be a late one to the first transmission, so that to the repetition may still come.
         let sent = if matches!(self.phase, Phase::Sending(_)) { now } else { self.sent };
         if let Some(row) = table.row_of(flight).filter(|row| flight.is_ambiguous || row.is_outstanding(now)) {
-            // What came may be another's reply, or that of a stop to an earlier transmission: its own is to come then.
+            // It may be the reply to another exchange, or to an earlier transmission of a stop; its own is still to
+            // come then.
             row.leaves_outstanding(flight.repeated.saturating_add(1), sent + row.late(), now);
         } else {
             leave_outstanding(table, flight, flight.repeated, sent, now);
@@ -384,7 +385,7 @@ impl Line {
         self.echo = None;
     }
 
-    /// Why the request has failed, if it has. A wrong reply has, once the line is silent behind it.
+    /// The failed request and why it failed, if it has. A wrong reply fails once the line is silent after it.
     pub(crate) fn failure(&self, line: &LineTiming, now: Instant) -> Option<(Flight, Failure)> {
         let Phase::Waiting(flight) = self.phase else { return None };
         match flight.is_wrong {
@@ -396,7 +397,7 @@ impl Line {
         }
     }
 
-    /// Repeats the request, or gives it up.
+    /// Repeats the request or gives it up.
     pub(crate) fn failed(
         &mut self,
         table: &mut ExchangeTable<'_>,
@@ -417,7 +418,7 @@ impl Line {
         };
         *counter = counter.wrapping_add(1);
         if failure == Failure::Echo {
-            // What came may have been the echo, and the reply is still to come.
+            // The frame may have been the echo, and the reply may still come.
             let unanswered = flight.unanswered.min(sent);
             let count = flight.repeated.saturating_add(1);
             leave_outstanding(table, Flight { unanswered, ..flight }, count, sent, now);
@@ -428,7 +429,7 @@ impl Line {
         }
         let unanswered =
             if failure == Failure::Checksum { flight.unanswered } else { flight.unanswered.min(sent) };
-        // The peer has the request of which it said that it is at it.
+        // No repetition of a request that the peer reported to be processing: the peer has it.
         if is_there && flight.repeated < retries && !flight.is_pending && !yields {
             counters.retries = counters.retries.wrapping_add(1);
             let repeated = flight.repeated.saturating_add(1);
@@ -438,7 +439,7 @@ impl Line {
             return Over::Repeated;
         }
         if failure == Failure::Timeout && self.echo_setting == Echo::Auto {
-            // The adapter may be another one.
+            // The adapter may have been replaced.
             self.has_echo = None;
         }
         let was_wrong = flight.was_wrong || failure == Failure::Checksum;
@@ -458,14 +459,14 @@ impl Line {
         let nth = usize::from(flight.exchange);
         let news = self.turns(table, |turns| match failure {
             Failure::Timeout => turns.failed(nth, flight.cause, now, flight.unanswered.min(sent)),
-            // It said something, and nobody knows what.
+            // The peer sent something that is unreadable.
             _ => turns.answered(nth, flight.cause, Ended::Unclear, now),
         });
         self.rest(table, flight, now);
         news
     }
 
-    /// The rest of the line is over.
+    /// Ends the pause.
     pub(crate) fn advance(&mut self, now: Instant) {
         if let Phase::Resting(until) = self.phase
             && now >= until
@@ -475,19 +476,18 @@ impl Line {
         }
     }
 
-    /// The line is to be looked at: something is wanted, or may be asked earlier than it was.
+    /// Check for the next exchange: one is wanted, or may be sent earlier than it was.
     pub(crate) const fn look(&mut self, now: Instant) {
         self.look_at = now;
     }
 
-    /// The exchange is asked as soon as the line is free.
+    /// Sends the exchange as soon as the line is free.
     pub(crate) fn request(&mut self, table: &mut ExchangeTable<'_>, exchange: usize, now: Instant) {
         self.turns(table, |turns| turns.request(exchange, now));
         self.look_at = now;
     }
 
-    /// What has begun is not continued: the device is gone, or the gateway slept. Returns the request that was on its
-    /// way.
+    /// Abandons what has begun: the device is gone, or the gateway slept. Returns the request that occupied the line.
     pub(crate) fn abandon(&mut self, table: &mut ExchangeTable<'_>, now: Instant) -> Option<Flight> {
         let flight = self.occupied_by();
         if let Some(all) = &mut self.transactions {
@@ -498,7 +498,7 @@ impl Line {
             (self.phase, self.look_at) = (Phase::Idle, now);
             return flight;
         }
-        // One without a reply is sent once, whether it is heard or not.
+        // A request without a reply is sent only once, received or not.
         if let Some(Flight { exchange, cause: Cause::State(Some(_)), .. }) = flight
             && table.rows.get(usize::from(exchange)).is_some_and(Row::is_answered)
         {
@@ -515,8 +515,8 @@ impl Line {
         flight
     }
 
-    /// The device is there, perhaps another one: what is asked at the start is asked. A connection of Modbus TCP that is
-    /// there again says nothing about its devices.
+    /// The device is up, perhaps another one: its start exchanges are due. A Modbus TCP connection that is up again
+    /// says nothing about its devices.
     pub(crate) fn begin(&mut self, table: &mut ExchangeTable<'_>, now: Instant) {
         self.abandon(table, now);
         let is_resumed =
@@ -525,7 +525,7 @@ impl Line {
         self.has_echo = self.echo_setting.known();
     }
 
-    /// When something happens without an input.
+    /// When something is due without an input.
     pub(crate) fn deadline(&self, line: &LineTiming) -> Instant {
         let looks = self.looks.as_ref().map_or(Instant::NEVER, Grid::next);
         let next = match self.phase {
@@ -548,8 +548,8 @@ impl Line {
     }
 }
 
-/// A reply to an earlier transmission may still come. Behind what had a wrong checksum, and may have been noise, it is
-/// not later than two timeouts.
+/// A reply to an earlier transmission may still arrive. After a wrong checksum, which may have been noise, it arrives
+/// within two timeouts.
 fn leave_outstanding(table: &mut ExchangeTable<'_>, flight: Flight, count: u8, sent: Instant, now: Instant) {
     let Some(row) = table.row_of(flight) else { return };
     if flight.unanswered().is_some() {
@@ -559,7 +559,7 @@ fn leave_outstanding(table: &mut ExchangeTable<'_>, flight: Flight, count: u8, s
     }
 }
 
-/// How long pending answers are waited for, in timeouts.
+/// The longest wait for a reply after pending answers, in timeouts.
 const LONGEST_PENDING: u64 = 16;
 
 fn resting(until: Instant, now: Instant) -> Phase {

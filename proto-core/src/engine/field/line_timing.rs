@@ -1,6 +1,6 @@
 //! When a half-duplex line is free, and when silence ends a frame.
 //!
-//! In: a port's settings, and when bytes came. Out: instants. Does not know what the bytes are.
+//! In: a port's settings, and when bytes arrived. Out: instants. Does not know what the bytes are.
 
 use crate::config::Rs485;
 use crate::time::{Duration, Instant};
@@ -10,9 +10,9 @@ use crate::time::{Duration, Instant};
 pub(crate) struct LineTiming {
     pub idle_gap: Duration,
     pub turnaround: Duration,
-    /// After this long without a byte, what was sent is complete.
+    /// After this long without a byte, a reply is complete.
     silence: Duration,
-    /// When the newest bytes came.
+    /// When the newest bytes arrived.
     pub heard: Instant,
 }
 
@@ -34,12 +34,12 @@ impl LineTiming {
         self.heard + self.turnaround
     }
 
-    /// When a frame is given up that has begun, if one has.
+    /// When silence ends the partial frame, if there is one.
     pub(crate) fn partial_until(&self, has_begun: bool) -> Instant {
         if has_begun { self.heard + self.idle_gap } else { Instant::NEVER }
     }
 
-    /// When the line has been silent for so long that what was sent is complete.
+    /// When the line has been silent for so long that a reply is complete.
     pub(crate) fn silent_at(&self) -> Instant {
         self.heard + self.silence
     }

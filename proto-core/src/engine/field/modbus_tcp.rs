@@ -1,29 +1,29 @@
-//! Modbus TCP on a port: the header before each request, and which request a reply belongs to (docs/engine.md
-//! section 13).
+//! Modbus TCP on a port: the header before each request, and which request a reply belongs to (docs/engine.md section
+//! 13).
 //!
-//! In: requests without a header, and what came on the connection. Out: frames, and what they are. A reply belongs to
-//! the request with its transaction id, so nothing waits for late replies here.
+//! In: requests without a header, and received bytes. Out: frames, and their exchanges. A reply belongs to the request
+//! with its transaction id, so nothing has to wait for late replies here.
 
 use crate::device::Probe;
 use crate::modbus::adu::{PREFIX_LEN, frame_len};
 use crate::modbus::rtu::CRC_LEN;
 
-/// How many requests back a reply is known as late. Of older ones it is known as nobody's.
+/// Number of newest requests whose replies are recognized when late. Replies to older ones belong to no exchange.
 const KEPT: usize = 4;
 
-/// No exchange: a port has fewer.
+/// Marks an answered request. No exchange has this index: a port has fewer.
 const ANSWERED: u8 = u8::MAX;
 
 /// The transactions of one port.
 #[derive(Debug, Clone)]
 pub(crate) struct Transactions {
-    /// The id of the newest request. It goes on over connections, and wraps.
+    /// The id of the newest request. It continues over reconnects, and wraps.
     pub newest: u16,
-    /// The newest requests, each in the place of its id, with their exchanges; [`ANSWERED`] after a reply.
+    /// The newest requests with their exchanges, in the slot of their id; [`ANSWERED`] after a reply.
     unanswered: [(u16, u8); KEPT],
-    /// A connection was there before.
+    /// There was a connection before.
     pub was_open: bool,
-    /// Frames cannot be found any more: the connection is to be closed.
+    /// Frames can no longer be found: the connection has to be closed.
     pub is_lost: bool,
 }
 
@@ -32,18 +32,18 @@ impl Transactions {
         Self { newest: 0, unanswered: [(0, ANSWERED); KEPT], was_open: false, is_lost: false }
     }
 
-    /// The connection is gone, and no reply comes on another one.
+    /// The connection is gone; no reply comes over another one.
     pub(crate) const fn forget(&mut self) {
         self.unanswered = [(0, ANSWERED); KEPT];
         self.is_lost = false;
     }
 
-    /// Puts the header before a request of an exchange, which is a frame of RTU behind the place for the header. Returns
-    /// the length of the whole.
+    /// Puts the header before an exchange's request, an RTU frame that stands after the room for the header. Returns
+    /// the total length.
     pub(crate) fn begin(&mut self, exchange: u8, len: usize, out: &mut [u8]) -> Option<usize> {
         self.newest = self.newest.wrapping_add(1);
         let ([t1, t0], len) = (self.newest.to_be_bytes(), len.saturating_sub(CRC_LEN));
-        // At most 255, since a PDU has at most 253.
+        // At most 255, since a PDU has at most 253 bytes.
         let [l1, l0] = (len as u16).to_be_bytes();
         *out.first_chunk_mut()? = [t1, t0, 0, 0, l1, l0];
         if let Some(slot) = self.unanswered.get_mut(slot_of(self.newest)) {
@@ -52,7 +52,7 @@ impl Transactions {
         Some(len.saturating_add(PREFIX_LEN))
     }
 
-    /// The exchange of a request without a reply; it has one now.
+    /// The exchange of an unanswered request, which is answered now.
     pub(crate) fn take(&mut self, id: u16) -> Option<u8> {
         let (_, exchange) = self.unanswered.get_mut(slot_of(id)).filter(|(of, _)| *of == id)?;
         Some(core::mem::replace(exchange, ANSWERED)).filter(|exchange| *exchange != ANSWERED)
@@ -63,8 +63,7 @@ fn slot_of(id: u16) -> usize {
     usize::from(id) % KEPT
 }
 
-/// What the bytes of a connection begin with. Behind a header that is wrong, frames cannot be found any more:
-/// [`Probe::Other`].
+/// Matches the start of a connection's bytes. After a wrong header no frame can be found: [`Probe::Other`].
 pub(crate) fn probe(bytes: &[u8]) -> Probe {
     let Some(prefix) = bytes.first_chunk() else {
         return Probe::Partial(PREFIX_LEN.saturating_sub(bytes.len()));
@@ -76,7 +75,7 @@ pub(crate) fn probe(bytes: &[u8]) -> Probe {
     }
 }
 
-/// The content of a good reply, and the code of a refusal.
+/// The data of a good reply, and the code of a refusal.
 pub(crate) fn content(frame: &[u8]) -> (&[u8], Option<u8>) {
     let body = frame.get(PREFIX_LEN..).unwrap_or(&[]);
     (body.get(3..).unwrap_or(&[]), body.get(2).copied())

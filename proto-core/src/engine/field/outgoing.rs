@@ -1,4 +1,4 @@
-//! Frames of a device's own, made from the image.
+//! Makes device frames from the image.
 //!
 //! In: the image, the port's bindings and texts. Out: the bytes of a frame. Does not know when one is due.
 
@@ -10,7 +10,7 @@ use crate::engine::io::ReplyCode;
 use crate::image::Image;
 use crate::sysvar::Direction;
 
-/// What output frames are made from.
+/// The sources of an output frame's values.
 #[derive(Clone, Copy)]
 pub(crate) struct Outgoing<'a> {
     pub image: &'a Image,
@@ -36,7 +36,7 @@ impl Outgoing<'_> {
         format.layout.encode_with(fields.iter().map(OutputBind::element), number, text, out)
     }
 
-    /// The same with escape bytes, if there are any.
+    /// Like [`Self::write`], with escape bytes if the recipe has them.
     pub(crate) fn encode(
         &self,
         format: &DeviceFormat,

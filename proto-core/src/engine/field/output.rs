@@ -1,8 +1,7 @@
-//! The frames that a field port sends, made from the image or from the bindings of a user-defined
-//! recipe.
+//! The frames that a field port sends, made from the image or from the bindings of a user-defined recipe.
 //!
-//! In: the image, when the port's sender says that a frame is due. Out: bytes or CAN frames, one
-//! per call. Does not know when a frame is due.
+//! In: the image, when the port's sender has a frame due. Out: bytes or CAN frames, one per call. Does not know when a
+//! frame is due.
 
 use super::bindings::{Outputs, values};
 use super::codec::Codec;
@@ -14,7 +13,7 @@ use crate::recipe::model::Mode;
 use crate::time::Instant;
 use crate::wire::can::CanFrame;
 
-/// One item to send to the field.
+/// A frame to send to the field; bytes are given by their length.
 pub(crate) enum Downward {
     Bytes(usize),
     Can(CanFrame),

@@ -1,7 +1,7 @@
-//! What may come on a port with exchanges, and what a frame that came is.
+//! Classifies the frames that arrive on a port with exchanges.
 //!
-//! In: the request on its way, those whose replies may still come, and the frames that come unasked. Out: the frame's
-//! part in it. Applies nothing.
+//! In: the request in flight, exchanges whose replies may still arrive, and unsolicited frames. Out: the part of a
+//! frame in its exchange. Applies nothing.
 
 use super::bindings::InputBind;
 use super::exchanges::{Asks, ExchangeItem, InputFormat, OtherFormat};
@@ -14,30 +14,30 @@ use crate::modbus::adu::PREFIX_LEN;
 use crate::modbus::rtu::{self, Expected, MAX_ADU, REFUSAL_LEN};
 use crate::time::Instant;
 
-/// What a received frame is.
+/// The meaning of a received frame.
 pub(crate) enum Heard<'i> {
-    /// The echo of the own request.
+    /// The echo of the gateway's request.
     Echo,
-    /// The pending reply; the data of a Modbus frame, or the frame.
+    /// The expected reply, with the format of its data.
     Reply(Option<&'i InputFormat>),
-    /// The pending reply, or the echo of the own request.
+    /// The expected reply, or the echo of the gateway's request.
     ReplyOrEcho,
-    /// The device is at it; its answer follows.
+    /// The device is still processing the request; its reply follows.
     Pending(&'i OtherFormat),
-    /// The device refuses the request; with a frame of its own.
+    /// The device refuses the request, perhaps with a frame that has values.
     Refusal(Option<&'i OtherFormat>),
-    /// A reply to an earlier request of this exchange that came too late, or its pending answer.
+    /// A reply to an earlier request of this exchange that arrived too late, or its pending answer.
     Late { exchange: u8, is_pending: bool },
-    /// An answer to one of several requests; nothing tells which.
+    /// A reply to one of several requests; nothing tells which.
     Ambiguous,
-    /// A frame that comes unasked, its place in the store, and its exchange if it is of one.
+    /// An unsolicited frame, its place in the store, and its exchange if it belongs to one.
     Unasked(&'i DeviceFormat, usize, Option<u8>),
 }
 
-/// What may come now.
+/// The frames that may arrive now.
 #[derive(Clone, Copy)]
 pub(crate) struct PendingReplies<'i> {
-    /// The frames of the recipe's part.
+    /// The frames of the recipe's input part.
     pub formats: &'i [DeviceFormat],
     pub first_frame: u8,
     pub items: &'i [ExchangeItem],
@@ -45,7 +45,7 @@ pub(crate) struct PendingReplies<'i> {
     pub flight: Option<Flight>,
     /// The echo of the request that comes, or may come, before its reply.
     pub echo: Option<OwnRequest>,
-    /// Whether it comes for sure.
+    /// Whether the echo is certain.
     pub has_echo: bool,
     pub bindings: &'i [InputBind],
     pub now: Instant,
@@ -56,22 +56,22 @@ impl<'i> PendingReplies<'i> {
         self.items.get(usize::from(self.flight?.exchange))
     }
 
-    /// The reply of a Modbus slave that is pending.
+    /// The expected reply of a Modbus slave.
     pub(crate) fn expected(&self) -> Option<Expected> {
         self.flight?.expected
     }
 
-    /// Nothing but the own echo is pending.
+    /// Whether nothing but the echo can come yet.
     fn waits_for_echo(&self) -> bool {
         self.has_echo && self.echo.is_some()
     }
 
-    /// The answers that a device's own frames are.
+    /// The possible replies to the request in flight, apart from Modbus frames.
     pub(crate) fn answers(&self) -> impl Iterator<Item = &'i DeviceFormat> {
         self.asked().filter(|_| !self.waits_for_echo()).into_iter().flat_map(answers_of)
     }
 
-    /// The exchanges whose replies may still come, but for the one that is on its way.
+    /// The exchanges whose replies may still arrive, except the one in flight.
     fn outstanding(&self) -> impl Iterator<Item = (u8, &'i Row, &'i ExchangeItem)> {
         let (own, now) = (self.flight.map(|flight| flight.exchange), self.now);
         let all = (0_u8..).zip(self.rows).zip(self.items).map(|((nth, row), item)| (nth, row, item));
@@ -86,7 +86,7 @@ impl<'i> PendingReplies<'i> {
         part.chain(others.map(|(nth, reply)| (&reply.format, usize::from(reply.slot), Some(nth))))
     }
 
-    /// What bytes of a line are.
+    /// Matches bytes of a line.
     pub(crate) fn probe(&self, bytes: &[u8]) -> Probe {
         let mut best = match self.expected().filter(|_| !self.waits_for_echo()) {
             Some(expected) => probe_reply(&expected, bytes),
@@ -104,8 +104,8 @@ impl<'i> PendingReplies<'i> {
             best = better(best, probe(format, self.bindings, bytes));
         }
         let Probe::Other(_) = best else { return best };
-        // One of ours may begin with what is a shorter frame by chance: a byte that is the same as that of
-        // the shorter one's checksum goes on with a right checksum.
+        // One of our frames may happen to begin like a shorter frame of another device, if its byte at the place of
+        // that frame's checksum is right by chance.
         let begun = |format: &DeviceFormat| match probe(format, self.bindings, bytes) {
             Probe::Partial(missing) => {
                 let fields = elements(format.bindings.of(self.bindings));
@@ -116,13 +116,13 @@ impl<'i> PendingReplies<'i> {
         self.all().filter_map(begun).min().map_or(best, Probe::Partial)
     }
 
-    /// The frames that may come, but for those of Modbus.
+    /// The frames that may arrive, except those of Modbus.
     pub(crate) fn all(&self) -> impl Iterator<Item = &'i DeviceFormat> {
         let late = self.outstanding().flat_map(|(_, _, item)| answers_of(item));
         self.answers().chain(self.unasked().map(|(format, ..)| format)).chain(late)
     }
 
-    /// About how many steps it takes to see that bytes are none of the frames that may come.
+    /// Rough number of steps to see that bytes are none of the frames that may arrive.
     pub(crate) fn effort(&self) -> usize {
         let effort = |format: &DeviceFormat| {
             format.layout.lengths().1.saturating_add(usize::from(format.bindings.len))
@@ -130,7 +130,7 @@ impl<'i> PendingReplies<'i> {
         self.all().map(effort).fold(MAX_ADU, usize::saturating_add)
     }
 
-    /// What a frame of a line is that [`Self::probe`] has found.
+    /// The meaning of a frame that [`Self::probe`] has found.
     pub(crate) fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
         let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
         let is_echo = self.echo.is_some_and(|echo| echo.probe(frame) == Probe::Frame(frame.len()));
@@ -159,8 +159,8 @@ impl<'i> PendingReplies<'i> {
         })
     }
 
-    /// What a frame of Modbus TCP is that [`modbus_tcp::probe`](super::modbus_tcp::probe) has found; `None` if it answers
-    /// no request.
+    /// The meaning of a Modbus TCP frame that [`modbus_tcp::probe`](super::modbus_tcp::probe) has found; `None` if it
+    /// answers no request.
     pub(crate) fn heard_on_tcp(&self, all: &mut Transactions, frame: &[u8]) -> Option<Heard<'i>> {
         let (&[t1, t0, ..], body) = frame.split_first_chunk::<PREFIX_LEN>()?;
         let id = u16::from_be_bytes([t1, t0]);
@@ -172,8 +172,8 @@ impl<'i> PendingReplies<'i> {
         if is_good { Some(Heard::Reply(self.asked()?.reply.as_ref())) } else { Some(Heard::Refusal(None)) }
     }
 
-    /// An answer, unless it may be a refusal of another request or its pending answer; else a late reply. Frames of a
-    /// device's own are told by `is`, those of Modbus by `is_expected`.
+    /// The answer, or [`Heard::Ambiguous`] if it may also be another request's refusal or pending answer; without an
+    /// answer, a late reply. `is` matches device frames, `is_expected` Modbus frames.
     pub(crate) fn classify(
         &self,
         answer: Option<Heard<'i>>,
@@ -204,13 +204,12 @@ impl<'i> PendingReplies<'i> {
     }
 }
 
-/// Which of its answers a frame is, in their order.
+/// Which of the possible replies a frame is, by the order of [`answers_of`].
 fn place_of(item: &ExchangeItem, is: &impl Fn(&DeviceFormat) -> bool) -> Option<u8> {
     (0..3).find(|nth| answer_of(item, *nth).is_some_and(is))
 }
 
-/// The answers of an exchange with frames of the device's own, in the order in which they are looked for: its reply, its
-/// pending answer, its refusal.
+/// The device frames that may answer an exchange, in the order of matching: its reply, its pending answer, its refusal.
 pub(crate) fn answers_of(item: &ExchangeItem) -> impl Iterator<Item = &DeviceFormat> {
     (0..3_u8).filter_map(|nth| answer_of(item, nth))
 }
@@ -236,7 +235,7 @@ fn probe_reply(expected: &Expected, bytes: &[u8]) -> Probe {
     }
 }
 
-/// A late reply; one with a wrong checksum is nothing.
+/// A late reply; one with a wrong checksum does not count.
 fn right_reply(expected: &Expected, bytes: &[u8]) -> Probe {
     match probe_reply(expected, bytes) {
         Probe::Wrong(_) => Probe::No(1),

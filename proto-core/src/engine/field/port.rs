@@ -1,7 +1,7 @@
-//! One port on the field side: frames in, frames out, and the timing of a shared line.
+//! One field port: frames in, frames out, and the timing of a shared line.
 //!
-//! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know
-//! how values reach the controller.
+//! In: bytes and CAN frames. Out: values in the store, and frames when they are due. Does not know how values reach the
+//! controller.
 
 use super::bindings::{InputBind, forget_commands};
 use super::codec::{Codec, DeviceCodec};
@@ -25,20 +25,21 @@ use crate::wire::can::{CanFrame, CanId};
 #[derive(Debug, Clone)]
 pub(crate) struct FieldPort {
     pub id: PortId,
-    /// Its name in the configuration, and the place of its recipe there.
+    /// Its name in the configuration; `recipe`: the index of its recipe there.
     pub name: Name,
     pub recipe: u8,
     pub codec: Codec,
     pub mode: Mode,
     pub line: LineTiming,
-    /// Whether a frame has begun that silence ends. Noted after each change: deadlines are asked for far more often.
+    /// Whether there is a partial frame that silence can end. Updated after each change, because deadlines are computed
+    /// far more often.
     pub is_partial: bool,
     pub sender: Sender,
-    /// The port's range of the input bindings; those of all CAN frames follow each other.
+    /// The port's range of the input bindings; those of its CAN frames are consecutive.
     pub inputs: Span,
     /// The port's range of the output bindings.
     pub outputs: Span,
-    /// Index of the first of the port's frames in the store.
+    /// Index of the port's first frame in the store.
     pub first_frame: u8,
     pub is_up: bool,
     pub bus: BusState,
@@ -48,7 +49,7 @@ pub(crate) struct FieldPort {
 }
 
 impl FieldPort {
-    /// The device is there.
+    /// The device is up.
     pub(crate) fn up(&mut self) {
         self.is_up = true;
     }
@@ -92,7 +93,7 @@ impl FieldPort {
         self.discard_partial(tap, now);
     }
 
-    /// Input that waited while the gateway itself slept is discarded, because its age is unknown.
+    /// Discards input that waited while the gateway itself slept, because its age is unknown.
     pub(crate) fn discard(&mut self, bytes: &[u8], can_id: Option<CanId>, tap: &mut Tap, now: Instant) {
         tap.record(|| came(self.id, now, Err(Rejection::Asleep), can_id, [bytes, &[], &[]]));
         keep(&mut self.last_rejection, Rejection::Asleep, can_id, bytes, now);
@@ -111,16 +112,16 @@ impl FieldPort {
         self.note_partial();
     }
 
-    /// Bytes came from the line; [`Self::frames`] reads them.
+    /// Notes bytes from the line, which [`Self::frames`] then reads.
     pub(crate) fn heard(&mut self, bytes: &[u8], now: Instant) {
         add(&mut self.counters.bytes_in, bytes.len());
         self.line.heard = now;
     }
 
-    /// Takes bytes from the line that only continue or begin a frame: nothing but a deadline comes of them. The
-    /// deadline, if it may be earlier than before; [`Instant::NEVER`] if not. `None` if [`Self::frames`] has to read
-    /// them; then nothing was taken.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
+    /// Takes bytes that only begin or continue a frame and at most set a deadline. Returns the deadline if it may be
+    /// earlier than before, else [`Instant::NEVER`]. `None` if [`Self::frames`] has to read the bytes; nothing was
+    /// taken then.
+    // The cost is in docs/performance.md section 1, like that of the other attributes here.
     #[inline]
     pub(crate) fn hold(&mut self, bytes: &[u8], now: Instant) -> Option<Instant> {
         let Codec::Stream { input: Some(layout), deframer, .. } = &mut self.codec else { return None };
@@ -130,12 +131,11 @@ impl FieldPort {
         }
         self.heard(bytes, now);
         self.is_partial = true;
-        // What is heard later only makes deadlines later.
+        // Further bytes only make the deadline later.
         Some(if had_begun { Instant::NEVER } else { self.partial_until() })
     }
 
-    /// Reads the frames in `rest`; stops after the first accepted one if the image is to be checked
-    /// after each frame.
+    /// Reads the frames in `rest`; stops after the first accepted one if the image has to be checked after each frame.
     pub(crate) fn frames(
         &mut self,
         rest: &mut &[u8],
@@ -149,7 +149,7 @@ impl FieldPort {
         let bytes = core::mem::take(rest);
         let usable = self.is_usable();
         let Codec::Stream { input, deframer, .. } = &mut self.codec else {
-            // In a place of its own, so that `rest` can stay in registers.
+            // A separate variable, so that `rest` can stay in registers.
             let mut left = bytes;
             accepted = self.device_frames(&mut left, bindings, store, commands, tap);
             *rest = left;
@@ -185,14 +185,14 @@ impl FieldPort {
         accepted
     }
 
-    /// Bytes for a port whose recipe has no input part.
+    /// Rejects bytes for a port whose recipe has no input part.
     pub(crate) fn not_asked_for(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
         bump(&mut self.counters.rejected_no_input);
         tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
         keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);
     }
 
-    /// A frame from the bus.
+    /// Reads a CAN frame.
     pub(crate) fn can(
         &mut self,
         frame: &CanFrame,
@@ -211,9 +211,9 @@ impl FieldPort {
         accepted
     }
 
-    /// Whether a rejected CAN frame is worth keeping. On a shared bus, frames for others are not, unless
-    /// none of the recipe's ids has ever come: then the id may be the one that was meant. A busy bus shows one
-    /// each 100 ms, because keeping a frame takes longer than rejecting it.
+    /// Whether a rejected CAN frame is worth keeping. On a shared bus frames for other nodes are not, unless none of
+    /// the recipe's ids has ever arrived: then the id may be misconfigured. Keeping a frame takes longer than rejecting
+    /// it, so at most one per 100 ms is kept.
     pub(crate) fn is_news(&self, why: Rejection, now: Instant) -> bool {
         let may_be_meant = |last: &LastRejection| {
             self.counters.frames_in == 0
@@ -223,8 +223,8 @@ impl FieldPort {
         why != Rejection::ForeignId || self.last_rejection.as_ref().is_none_or(may_be_meant)
     }
 
-    /// Counts a frame of an id that the recipe does not have, which is for another node of the bus. `false` if it is
-    /// worth keeping; then it was not counted.
+    /// Counts a frame with an id that is not in the recipe, which is for another node. False if it is worth keeping; it
+    /// was not counted then.
     #[inline(always)]
     pub(crate) fn passes_by(&mut self, frame: &CanFrame, now: Instant) -> bool {
         let Codec::Can { input: Some(layout), .. } = &self.codec else { return false };
@@ -274,7 +274,7 @@ impl FieldPort {
         Ok(())
     }
 
-    /// One of the port's commands has its result.
+    /// One of the port's commands has a result.
     pub(crate) fn command_ended(&mut self, outcome: Outcome) {
         if outcome.code == ReplyCode::NotSent {
             bump(&mut self.counters.commands_dropped);
@@ -284,8 +284,8 @@ impl FieldPort {
         }
     }
 
-    /// Handles the clock: cycles and silence. Returns whether silence has ended a frame, which is
-    /// still to be read with [`Self::frames`].
+    /// Handles what is due: cycles and silence. Returns whether silence has ended a frame, which [`Self::frames`] still
+    /// has to read.
     pub(crate) fn advance(&mut self, tap: &mut Tap, now: Instant) -> bool {
         let mut is_ended = false;
         if now >= self.partial_until() {
@@ -298,13 +298,13 @@ impl FieldPort {
         is_ended
     }
 
-    /// When something happens on the port without an input.
+    /// When the port has something to do without an input.
     pub(crate) fn deadline(&self) -> Instant {
         self.partial_until().min(self.send_deadline())
     }
 
-    /// The same after something was heard, if that has begun a frame or made one due; other deadlines stay as they
-    /// were. A port that may have an output is to be asked.
+    /// The deadline if input has begun a frame or made one due; others are unchanged then. Also flags a port that may
+    /// have an output.
     pub(crate) fn deadline_of_heard(&self, ask: &mut Dirty) -> Option<Instant> {
         let is_due = self.sender.is_due();
         ask.add(Dirty::PORTS.when(is_due));
@@ -316,7 +316,7 @@ impl FieldPort {
         self.sender.deadline(self.line.quiet_at())
     }
 
-    /// When the frame that has begun is given up; [`Instant::NEVER`] if none has.
+    /// When silence ends the partial frame; [`Instant::NEVER`] if there is none.
     pub(crate) fn partial_until(&self) -> Instant {
         debug_assert_eq!(self.is_partial, self.has_begun(), "not noted");
         self.line.partial_until(self.is_partial)
@@ -327,12 +327,12 @@ impl FieldPort {
         self.sender.is_due() && self.is_usable() && now >= self.line.quiet_at()
     }
 
-    /// Whether frames that are handed over now can leave.
+    /// Whether frames that are handed over can leave.
     pub(crate) fn is_usable(&self) -> bool {
         self.is_up && self.bus != BusState::BusOff
     }
 
-    /// Whether a frame has begun that silence ends.
+    /// Whether there is a partial frame that silence can end.
     fn has_begun(&self) -> bool {
         match &self.codec {
             Codec::Stream { deframer, .. } => deframer.pending() > 0,
@@ -341,7 +341,7 @@ impl FieldPort {
         }
     }
 
-    /// Bytes came, or were dropped.
+    /// Updates `is_partial` after bytes arrived or were discarded.
     pub(crate) fn note_partial(&mut self) {
         self.is_partial = self.has_begun();
     }
@@ -371,8 +371,8 @@ impl FieldPort {
         self.note_partial();
     }
 
-    /// `skipped` bytes of a chunk, or of bytes held before it, belong to no frame. Without silence
-    /// between, further ones belong to the same rejection.
+    /// `skipped` bytes of a chunk, or of bytes held before it, belong to no frame. Without silence between them,
+    /// further ones extend the same rejection.
     #[cold]
     pub(crate) fn no_frame(&mut self, bytes: &[u8], skipped: usize, tap: &mut Tap, now: Instant) {
         tap.record(|| came(self.id, now, Err(Rejection::NoFrame), None, [bytes, &[], &[]]));
@@ -406,7 +406,7 @@ pub(crate) fn keep(
     *last = Some(LastRejection::new(now, why, can_id, bytes));
 }
 
-/// Keeps why a device's frame was rejected, or a field of it.
+/// Keeps why a device frame, or a field of it, was rejected.
 pub(crate) fn keep_why(
     last: &mut Option<LastRejection>,
     verdict: Result<(), Rejection>,
@@ -425,7 +425,7 @@ pub(crate) fn keep_why(
     }
 }
 
-/// Input from a field port's device, for the tap.
+/// The tap record of input from a field port's device.
 pub(crate) fn came<'a>(
     port: PortId,
     at: Instant,
@@ -437,17 +437,16 @@ pub(crate) fn came<'a>(
     Tapped { at, place: TapPlace::Port(port), direction: TapDirection::In, verdict, can_id, pieces }
 }
 
-/// Number of fields in the part's frames before the `index`-th; the bindings of all frames follow
-/// each other.
+/// Number of fields in the part's frames before the `index`-th; the bindings of all frames are consecutive.
 pub(crate) fn fields_before(layout: &CanLayout, index: usize) -> usize {
     let before = layout.frames().take(index);
     before.fold(0, |sum, frame| sum.saturating_add(frame.fields().count()))
 }
 
-/// Time between two kept frames of ids that no recipe has.
+/// Time between two kept frames with ids that are in no recipe.
 const FOREIGN_PAUSE: Duration = Duration::from_millis(100);
 
-/// The port with this number: its place, if no listening port comes before it.
+/// The port with this id. Its index is the same unless a listening port comes before it.
 pub(crate) fn find_port(ports: &mut [FieldPort], id: PortId) -> Option<&mut FieldPort> {
     let nth = usize::from(id.0);
     match ports.get(nth) {

@@ -1,7 +1,7 @@
 //! The requests of exchanges: which is next, and its bytes.
 //!
-//! In: the image, the exchanges of a port, its line. Out: a request, unless a value of it is unknown or
-//! stale. The request of an event was made when it happened.
+//! In: the image, the exchanges of a port, its line. Out: a request, unless one of its values is unknown or stale. The
+//! request of an event was already made when it happened. Does not know replies.
 
 use core::num::NonZero;
 
@@ -22,7 +22,6 @@ use crate::modbus::rtu::{Expected, MAX_ADU};
 use crate::time::Instant;
 use crate::wire::can::CanId;
 
-/// Makes the frames of requests.
 pub(crate) struct Maker<'a> {
     pub image: &'a Image,
     pub bindings: Outputs<'a>,
@@ -33,8 +32,8 @@ pub(crate) struct Maker<'a> {
 }
 
 impl Maker<'_> {
-    /// Looks at values that ask, and makes the next request. Returns its exchange and its length in `out`. A request
-    /// that cannot be repeated is counted in `counters`.
+    /// Checks values that trigger requests, and makes the next request. Returns its exchange and its length in `out`. A
+    /// request that cannot be repeated is counted in `counters`.
     pub(crate) fn next(
         &self,
         line: &mut Line,
@@ -51,7 +50,7 @@ impl Maker<'_> {
                 }
             }
         }
-        // Each exchange that has no values yet is passed over once.
+        // Each exchange without values is skipped once.
         let at = if line.transactions.is_some() { PREFIX_LEN } else { 0 };
         for _ in 0..=items.len() {
             let body = out.get_mut(at..)?;
@@ -86,7 +85,8 @@ impl Maker<'_> {
             };
             let request = body.get(..len).unwrap_or(&[]);
             if line.transactions.is_none() && !flight.may_repeat(request) {
-                // A reply to the old value must not confirm the new one. The exchange is asked again when none can come.
+                // A late reply to the old value must not confirm the new one. The exchange is sent again when none can
+                // come any more.
                 bump(&mut counters.unanswered);
                 line.give_up(table, flight, Failure::Timeout, now);
                 continue;
@@ -101,7 +101,7 @@ impl Maker<'_> {
                     item.event = Event::Sent { len, until };
                 }
             } else {
-                // What goes out now is neither owed any more, nor a change.
+                // What is sent now is no longer owed, nor a change.
                 item.is_owed = false;
                 item.digest = content;
             }
@@ -116,7 +116,7 @@ impl Maker<'_> {
         None
     }
 
-    /// Whether a value of the request has changed, or it waited for its values.
+    /// Whether a value of the request has changed, or the values it was waiting for are there.
     fn is_wanted(&self, item: &mut ExchangeItem, out: &mut [u8]) -> bool {
         let mut is_wanted = item.is_owed && self.make(item, out).is_some();
         item.is_owed &= !is_wanted;
@@ -129,7 +129,7 @@ impl Maker<'_> {
         is_wanted
     }
 
-    /// What a request says now, but for a counter of frames: that changes with each.
+    /// Digest of the request without its frame counter, which changes every time.
     fn content(&self, item: &ExchangeItem, out: &mut [u8]) -> Option<NonZero<u64>> {
         let len = self.make_counted(item, 0, out).ok()?;
         Some(NonZero::<u64>::MIN | digest(DIGEST_SEED, out.get(..len).unwrap_or(&[])))
@@ -139,7 +139,7 @@ impl Maker<'_> {
         item.request.as_ref().map_or(&[], |format| format.bindings.of(self.bindings.binds))
     }
 
-    /// The groups of the variables whose values are in the request.
+    /// The groups of the variables in the request.
     pub(crate) fn groups_of(&self, item: &ExchangeItem) -> impl Iterator<Item = GroupId> {
         self.fields(item).iter().filter_map(|field| match field.from {
             OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => self.image.group(var),
@@ -147,12 +147,12 @@ impl Maker<'_> {
         })
     }
 
-    /// Writes the request of an event to the front of `out`, or says why it has none.
+    /// Writes the request of an event to the front of `out`; the error is why it cannot be sent.
     pub(crate) fn make_event(&self, item: &ExchangeItem, out: &mut [u8]) -> Result<usize, Outcome> {
         self.make_counted(item, self.sender.frames_sent, out)
     }
 
-    /// The same, with this number of frames before it.
+    /// Like [`Self::make_event`], with this value of the frame counter.
     fn make_counted(&self, item: &ExchangeItem, frames_sent: u32, out: &mut [u8]) -> Result<usize, Outcome> {
         if !self.fields(item).iter().all(|field| may_send(self.sender, self.image, field, self.now)) {
             return Err(Outcome::NoValue);
@@ -160,7 +160,7 @@ impl Maker<'_> {
         self.encode(item, frames_sent, out).ok_or(Outcome::OutOfLimits)
     }
 
-    /// Writes a request to the front of `out`; `None` if a value of it is unknown or stale.
+    /// Writes a request to the front of `out`; `None` if one of its values is unknown or stale.
     fn make(&self, item: &ExchangeItem, out: &mut [u8]) -> Option<usize> {
         self.make_event(item, out).ok()
     }
@@ -181,13 +181,13 @@ impl Maker<'_> {
     }
 }
 
-/// The request of an event as it was made.
+/// Copies the request of an event as it was made.
 fn copy(item: &ExchangeItem, kept: &[Piece], len: usize, out: &mut [u8]) {
     let kept = item.pieces.of(kept).iter().flatten().take(len);
     out.iter_mut().zip(kept).for_each(|(slot, &byte)| *slot = byte);
 }
 
-/// Index and subindex of an SDO request, with its command in front.
+/// Index and subindex of an SDO request.
 fn sdo_of(item: &ExchangeItem, request: &[u8]) -> Option<[u8; 3]> {
     let (request_id, reply_id) = (item.request.as_ref()?.key.id(), item.reply.as_ref()?.format.key.id());
     let (CanId::Standard(request_id @ 0x601..=0x67F), CanId::Standard(reply_id)) = (request_id, reply_id)

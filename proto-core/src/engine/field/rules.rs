@@ -1,9 +1,9 @@
-//! What stands behind input fields of devices: limits, tables, "no value", two's complement, and what says that a value was
-//! taken.
+//! The rules of input fields of devices: limits, tables, "no value", two's complement, and a variable that shows
+//! whether a value was taken.
 //!
-//! In: the number of a field, or why it could not be read. Out: the value of its variable, or why there is none. Rules are
-//! kept as single words behind the bindings of their port, in the room of further fields: fields without rules have no
-//! room for them.
+//! In: the number of a field, or why it could not be read. Out: the value of its variable, or why there is none. Rules
+//! are stored as single words after the bindings of their port, so fields without rules take no memory for them. Does
+//! not know frames.
 
 use heapless::Vec;
 
@@ -17,7 +17,7 @@ use crate::image::{bind_to_variable, round};
 use crate::sysvar::SysVar;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// The words of what stands behind a field.
+/// The words of the rules of a field.
 pub(crate) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + use<> {
     let mut words = [None; 3];
     let number = |is, number: f64| Some(Rule::new(is, number.to_bits()));
@@ -53,16 +53,16 @@ pub(crate) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + u
     words.into_iter().flatten().map(Rule::to_bind)
 }
 
-/// The word that begins the rules of a variable.
+/// The first word of a variable's rules.
 pub(crate) fn scale_word(scale: f32, offset: f32) -> InputBind {
     let high = u64::from(scale.to_bits()).unbounded_shl(32);
     Rule::new(Is::Scale, high | u64::from(offset.to_bits())).to_bind()
 }
 
-/// What becomes of the value of an input field that writes a variable.
+/// The verdict on the value of an input field that writes a variable.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Taken {
-    /// The variable becomes this.
+    /// The variable takes this value.
     Value(Scalar),
     /// The device says that it has no value now.
     NoValue,
@@ -70,9 +70,9 @@ pub enum Taken {
     Rejected(Rejection),
 }
 
-/// What a gateway makes of the value of an input field: the first of `fields`, which the others stand behind. `bytes` are those
-/// of the field in its frame, `value` is what [`Encoding::read`] makes of them. Also the lowest and the highest number that
-/// is taken, if not all are. `None` if the field writes no variable as a whole.
+/// The verdict on the value of an input field. `fields` are the field, then its rules, `bytes` those of the field in
+/// its frame, `value` the result of [`Encoding::read`]. Also returns the lowest and the highest number that is taken,
+/// if not all are. `None` if the field writes no variable as a whole.
 ///
 /// For tools that show frames; the engine does the same.
 pub fn judge_field(
@@ -96,7 +96,7 @@ pub fn judge_field(
     Some((rules.take(value, || Some(bytes)), rules.range()))
 }
 
-/// The variable of a field, and the numbers that it takes.
+/// The variable of a field, and the range of numbers it takes.
 pub(crate) fn allowed(binding: &InputBind, all: &[InputBind]) -> (Option<SysVar>, Option<(f64, f64)>) {
     if let Some(rules) = Rules::of(binding, all) {
         return (binding.to.variable(), rules.range());
@@ -122,7 +122,7 @@ pub(crate) struct Rules<'a> {
 }
 
 impl<'a> Rules<'a> {
-    /// Those of a field, of the bindings of all ports; `None` if it has none.
+    /// The rules of a field among the bindings of all ports; `None` if it has none.
     pub(crate) fn of(binding: &InputBind, all: &'a [InputBind]) -> Option<Self> {
         let InputTo::Ruled { var, first, count } = binding.to else { return None };
         let start = usize::from(first);
@@ -140,19 +140,19 @@ impl<'a> Rules<'a> {
         self.iter().find(|rule| rule.is == is)
     }
 
-    /// The variable, or the bits of it, that tells whether a value was taken.
+    /// The variable, or bits of it, that shows whether a value was taken.
     pub(crate) fn valid_to(self) -> Option<(SysVar, u8)> {
         let rule = self.find(Is::ValidTo)?;
         let [mask, var] = rule.halves();
         SysVar::from_ordinal(var as usize).map(|var| (var, mask as u8))
     }
 
-    /// The lowest and the highest number that limits let pass.
+    /// The lowest and the highest number within the limits.
     pub(crate) fn limits(self) -> Option<(f64, f64)> {
         Some((self.find(Is::Low)?.number(), self.find(Is::High)?.number()))
     }
 
-    /// What becomes of a number, or of bytes that are none; `bytes` are those of the field.
+    /// The verdict on a number, or on bytes that are none. `bytes` are those of the field.
     pub(crate) fn take(
         self,
         value: Result<Scalar, Unreadable>,
@@ -230,7 +230,7 @@ impl<'a> Rules<'a> {
         (!number.is_nan()).then_some(number)
     }
 
-    /// What the table has for a number; `None` without a table.
+    /// The number's entry in the table; `None` without a table.
     fn mapped(self, number: f64) -> Option<Option<f64>> {
         let (mut first, mut last, mut is_table) = (0_i64, 0_i64, false);
         for rule in self.iter() {
@@ -249,7 +249,7 @@ impl<'a> Rules<'a> {
         is_table.then(|| self.find(Is::Else).map(Rule::number))
     }
 
-    /// The numbers that its variable takes, before scale and offset; `None` if that is not one range.
+    /// The range of numbers that the variable takes, before scale and offset; `None` if it is not a single range.
     pub(crate) fn range(self) -> Option<(f64, f64)> {
         let is_table = self.find(Is::Becomes).is_some();
         let of_limits = self.limits().filter(|_| self.find(Is::Clamps).is_none());
@@ -269,7 +269,7 @@ impl<'a> Rules<'a> {
     }
 }
 
-/// A decimal number with a comma for its point.
+/// Reads a decimal number with a comma instead of a point.
 fn read_comma(encoding: Option<Encoding>, bytes: &[u8]) -> Result<Scalar, Unreadable> {
     let mut digits = [0; MAX_DIGITS];
     let digits = digits.get_mut(..bytes.len()).ok_or(Unreadable::TooLarge)?;

@@ -9,8 +9,8 @@ use crate::image::{ExtraSet, GroupId, Image, MAX_GROUPS, VarSet};
 use crate::schedule::Grid;
 use crate::time::{Duration, Instant};
 
-/// A set of the image's groups.
-// In words: numbers of 128 bits are slow on a Cortex-M.
+/// A set of groups of the image.
+// In 32-bit words, because 128-bit numbers are slow on a Cortex-M.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct GroupSet([u32; MAX_GROUPS.div_ceil(32)]);
 
@@ -21,7 +21,6 @@ impl GroupSet {
         }
     }
 
-    /// Whether something is true of all its groups.
     fn all(self, is_true: impl Fn(GroupId) -> bool) -> bool {
         for (nth, word) in self.0.into_iter().enumerate() {
             let mut left = word;
@@ -45,19 +44,19 @@ pub(crate) struct Sender {
     grid: Option<Grid>,
     /// Groups of the values: all must be known, and fresh unless the recipe holds.
     pub sources: GroupSet,
-    /// The variables, and the values of the state packet: all must be readable.
+    /// The variables and the values of the state packet: all must be readable.
     pub shown: VarSet,
     pub shown_extra: ExtraSet,
-    /// Whether it shows the health of ports.
+    /// Whether the output shows the health of ports.
     pub shows_health: bool,
     due: bool,
-    /// Since when the frame has been due, until that is taken.
+    /// Since when the frame has been due, until that is recorded.
     due_since: Since,
     in_flight: bool,
     /// The next CAN frame of a cycle that is being handed over.
     pub next_can: usize,
     digest: Option<u64>,
-    /// Of a port that sends only changes: after this long it sends all the same.
+    /// A port that sends only changes also sends after this long without one.
     pub refresh: Duration,
     refresh_at: Instant,
     last_bit: Option<bool>,
@@ -105,7 +104,7 @@ impl Sender {
         self.on == SendOn::Change
     }
 
-    /// The port is gone or bus-off: due frames are dropped.
+    /// The port is down or bus-off: drops due frames.
     pub(crate) fn reset(&mut self) {
         self.due = false;
         self.in_flight = false;
@@ -113,7 +112,7 @@ impl Sender {
         self.digest = None;
     }
 
-    /// The gateway slept: due frames are dropped. Frames that were handed over are still reported.
+    /// The gateway slept: drops due frames. Frames already handed over are still reported as sent.
     pub(crate) fn skip(&mut self) {
         self.due = false;
         self.next_can = 0;
@@ -133,17 +132,17 @@ impl Sender {
         self.in_flight
     }
 
-    /// The line is somebody else's until [`Self::sent`].
+    /// Keeps the output off the line until [`Self::sent`].
     pub(crate) fn hold(&mut self) {
         self.in_flight = true;
     }
 
-    /// How old a value may be that is sent.
+    /// How old a value to be sent may be.
     pub(crate) const fn stale_after(&self) -> Duration {
         self.stale_after
     }
 
-    /// Whether a value that came at this instant may be sent.
+    /// Whether a value that arrived at `came` may be sent.
     pub(crate) fn is_fresh(&self, came: Instant, now: Instant) -> bool {
         self.on_stale == OnStale::Hold || now.saturating_since(came) <= self.stale_after
     }
@@ -153,7 +152,7 @@ impl Sender {
         self.in_flight = false;
     }
 
-    /// The same, if nothing else is due; else it is not noted, and the answer is `false`.
+    /// [`Self::sent`] if no frame is due; otherwise returns false and changes nothing.
     pub(crate) fn sent_before_next(&mut self) -> bool {
         self.in_flight &= self.due;
         !self.due
@@ -172,7 +171,7 @@ impl Sender {
         self.frames_sent = self.frames_sent.wrapping_add(1);
     }
 
-    /// A frame that is not of the output part was handed over; the line is held until it has left.
+    /// A frame outside of the output part was handed over; the line is held until it has left.
     pub(crate) fn handed_over_beside(&mut self) {
         self.hold();
         self.frames_sent = self.frames_sent.wrapping_add(1);
@@ -215,7 +214,7 @@ impl Sender {
         self.raise(counters, Since::at(now));
     }
 
-    /// Values in the image changed: checks the bit that triggers.
+    /// Values in the image changed: checks the trigger bit.
     pub(crate) fn image_changed(
         &mut self,
         image: &Image,
@@ -243,7 +242,7 @@ impl Sender {
             })
     }
 
-    /// Whether all values are readable, and those whose fields are rejected are fresh: their frames' age is not theirs.
+    /// Whether all values are readable, and those of rejected fields are fresh, which their frames' age does not show.
     fn can_show(&self, image: &Image, now: Instant) -> bool {
         image.can_read(&self.shown, self.shown_extra)
             && self
@@ -252,8 +251,8 @@ impl Sender {
                 .all(|var| image.known_since(var).is_some_and(|at| self.is_fresh(at, now)))
     }
 
-    /// Whether a frame with this digest is new, on a port that sends only changes, or is to be sent
-    /// again. Other ports pay for no digest.
+    /// On a port that sends only changes, whether a frame with this digest is new or to be repeated. Other ports
+    /// compute no digest.
     pub(crate) fn is_news(&mut self, digest: impl FnOnce() -> u64, now: Instant) -> bool {
         self.on != SendOn::Change || self.is_change(digest(), now)
     }
@@ -267,8 +266,7 @@ impl Sender {
         news
     }
 
-    /// When something happens without an input; `quiet_at` is when the line is free for the
-    /// gateway.
+    /// When something is due without an input; `quiet_at` is when the line is free for the gateway.
     pub(crate) fn deadline(&self, quiet_at: Instant) -> Instant {
         let cycle = self.grid.as_ref().map_or(Instant::NEVER, Grid::next);
         if self.is_due() { cycle.min(quiet_at) } else { cycle }

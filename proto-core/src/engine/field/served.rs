@@ -1,8 +1,8 @@
 //! Field ports on which the gateway is a slave: a master reads and writes blocks of registers.
 //!
-//! In: requests that the slave of the line has found. Out: values in the store, and replies. A block
-//! is written as a whole or not at all; one with a value that is unknown or stale is not read. A block
-//! that a master writes is kept, and read back as it was written.
+//! In: requests that the slave of the line has received. Out: values in the store, and replies. A block is written as a
+//! whole or not at all; a block with an unknown or stale value cannot be read. A block that a master writes is read
+//! back as it was written. Does not know how requests are found.
 
 use super::bindings::{InputBind, Outputs};
 use super::codec::{Codec, DeviceCodec, Reader};
@@ -39,7 +39,7 @@ struct Blocks<'a> {
 }
 
 impl Blocks<'_> {
-    /// The block of a table with this address, and the block's first address.
+    /// The block of a table that contains this address, and the block's first address.
     fn block_at(&self, table: Table, at: u16) -> Result<(u16, &ExchangeItem), Exception> {
         let mut found = self.items.iter().filter_map(|item| match item.asks {
             Asks::Served { table: own, address, count } if own == table => {
@@ -63,7 +63,7 @@ impl Blocks<'_> {
         out.get(..len).ok_or(Exception::DeviceFailure)
     }
 
-    /// What a master has written.
+    /// The block as a master has written it.
     fn kept<'o>(&self, item: &ExchangeItem, out: &'o mut [u8; MAX_DATA]) -> Result<&'o [u8], Exception> {
         let block = item.reply.as_ref().filter(|_| item.is_written).ok_or(Exception::DeviceFailure)?;
         let kept = item.pieces.of(self.written).iter().flatten();
@@ -81,7 +81,7 @@ impl Blocks<'_> {
             let data = self.data(item, &mut buffer)?;
             let behind = usize::from(at.saturating_sub(first)).saturating_mul(2);
             let (pairs, _) = data.get(behind..).unwrap_or(&[]).as_chunks::<2>();
-            // Before the words, so that none is lost when the block ends.
+            // Pairs before words: `zip` would drop a word when the block ends.
             for (pair, word) in pairs.iter().zip(&mut words) {
                 *word = *pair;
                 at = at.wrapping_add(1);
@@ -117,7 +117,7 @@ impl Blocks<'_> {
         Ok(())
     }
 
-    /// Writes the block that begins at this address and has so many registers or coils.
+    /// Writes the block with exactly this address and number of registers or coils.
     fn write(&mut self, table: Table, address: u16, count: u16, data: &[u8]) -> Result<(), Exception> {
         let is_it = |asks: Asks| matches!(asks, Asks::Served { table: own, address: at, count: len } if (own, at, len) == (table, address, count));
         let item = self.items.iter_mut().find(|item| item.reply.is_some() && is_it(item.asks));
@@ -170,7 +170,7 @@ impl RegisterBank for Blocks<'_> {
 }
 
 impl FieldPort {
-    /// Whether a request has ended that is to be served.
+    /// Whether a complete request is to be served.
     pub(crate) fn is_asked(&self, now: Instant) -> bool {
         self.slave_deadline() <= now
     }
@@ -183,7 +183,7 @@ impl FieldPort {
         }
     }
 
-    /// Carries out what a master asks; its reply is kept until the line is free.
+    /// Executes a master's request; the reply is kept until the line is free.
     pub(crate) fn serve(
         &mut self,
         (inputs, outputs): (&[InputBind], Outputs<'_>),
@@ -265,7 +265,7 @@ impl FieldPort {
         Some(len)
     }
 
-    /// When a reply may be sent that waits.
+    /// When a waiting reply may be sent.
     pub(crate) fn reply_deadline(&self) -> Instant {
         match &self.codec {
             Codec::Device(DeviceCodec { reader: Some(Reader::Slave(slave)), .. })

@@ -1,4 +1,4 @@
-//! Texts in frames of devices: into variables, and from them.
+//! Texts in device frames: to variables and from them.
 
 use heapless::Vec;
 
@@ -11,10 +11,10 @@ use crate::image::{Image, bind_to_variable};
 use crate::sysvar::{Direction, SysVar};
 use crate::wire::scalar::Scalar;
 
-/// Maximum number of texts of one port, both ways together.
+/// Maximum number of texts of one port, input and output together.
 pub(crate) const MAX_TEXTS: usize = 8;
 
-/// Where a text goes to, or comes from.
+/// The target or source of a text.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TextBind {
     pub direction: Direction,
@@ -26,7 +26,7 @@ pub(crate) struct TextBind {
     pub ignored: Ignored,
 }
 
-/// The texts of a recipe, whose bindings begin at these places.
+/// The texts of a recipe; its bindings begin at these places.
 pub(crate) fn texts_of(
     config: ConfigView<'_>,
     recipe: &Recipe,
@@ -58,18 +58,17 @@ impl TextBind {
             && self.binding.checked_sub(bindings.start).is_some_and(|at| at < bindings.len)
     }
 
-    /// Whether it is the input text of this binding.
     pub(crate) fn is_input(&self, binding: u16) -> bool {
         self.direction == Direction::Input && self.binding == binding
     }
 
-    /// The variables that an input text becomes.
+    /// The variables that an input text sets.
     pub(crate) fn variables(&self) -> impl Iterator<Item = SysVar> + use<> {
         let words = self.words.into_iter().flat_map(Words::iter);
         words.chain(self.length).chain(self.count)
     }
 
-    /// Whether there is room for a text of `len` characters.
+    /// Whether a text of `len` characters fits.
     fn has_room(&self, len: usize) -> bool {
         self.words.is_none_or(|words| len <= words.room())
     }
@@ -83,7 +82,7 @@ impl TextBind {
             let pair = [character(0), character(1)];
             let is_low_first = self.words.is_some_and(|words| words.order == ByteOrder::Little);
             let word = if is_low_first { u16::from_le_bytes(pair) } else { u16::from_be_bytes(pair) };
-            // Validation has refused everything but words.
+            // Cannot fail: validation has refused all other types.
             let _ = image.set(var, Scalar::Word(word));
         }
         for (var, number) in [(self.length, text.len() as u32), (self.count, u32::from(nth as u16))] {
@@ -95,7 +94,7 @@ impl TextBind {
         }
     }
 
-    /// Writes an output text to the front of `out`, and returns its length.
+    /// Writes an output text to the front of `out` and returns its length.
     pub(crate) fn write(&self, image: &Image, out: &mut [u8]) -> Option<usize> {
         let words = self.words?;
         let len = self.length.map(|var| image.value(var).as_f64() as usize);
@@ -119,7 +118,7 @@ impl TextBind {
     }
 }
 
-/// The texts among some bindings, with their places in them.
+/// The texts among some bindings, each with its place there.
 pub(crate) fn texts_in(
     texts: &[TextBind],
     bindings: Span,
@@ -132,7 +131,7 @@ pub(crate) fn texts_in(
 }
 
 impl FrameContext<'_> {
-    /// The texts of an input frame, each with its place among the frame's fields, and the text if there is room for it.
+    /// The texts of an input frame, each with its place among the frame's fields, and the text if it fits.
     pub(crate) fn texts<'t>(
         &self,
         texts: &'t [TextBind],
@@ -153,7 +152,7 @@ impl FrameContext<'_> {
         })
     }
 
-    /// Whether one of the texts of an input frame says that there is nothing to say.
+    /// Whether a text of an input frame is one that is configured to be ignored.
     pub(crate) fn is_ignored(&self, texts: &[TextBind], format: &DeviceFormat, frame: &[u8]) -> bool {
         let bindings = format.bindings.of(self.bindings);
         let mut may_be =
@@ -164,7 +163,7 @@ impl FrameContext<'_> {
         })
     }
 
-    /// Puts the texts of an input frame into their variables, but those for which there is no room.
+    /// Puts the texts of an input frame into their variables, except those that do not fit.
     pub(crate) fn take_texts(&mut self, texts: &[TextBind], format: &DeviceFormat, frame: &[u8]) {
         let bindings = format.bindings.of(self.bindings);
         let nth = self.counters.frames_in.wrapping_add(1);

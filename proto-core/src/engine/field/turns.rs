@@ -1,41 +1,41 @@
 //! Which exchange has a line next (docs/engine.md section 13).
 //!
-//! In: when exchanges are wanted, and how they ended. Out: the next one, or when to look again. Does not know frames:
-//! one line, one exchange at a time, peers that may be silent.
+//! In: when exchanges are wanted, and how they ended. Out: the next one, or when to check again. Does not know frames:
+//! one line, one exchange at a time, peers that may not respond.
 //!
-//! A write that stops goes before everything else. Then come events, which expire, then other requested exchanges, the
-//! oldest request first; after [`REQUESTED_RUN`] of these a due period has its turn. Of the periods the one that ends
-//! first goes first. A period that is not served keeps its end, while those that are served get later ones, so a line
-//! with too much to do serves all of them in turn.
+//! A write that stops goes first. Then come events, which expire, then other requested exchanges, the oldest request
+//! first; after [`REQUESTED_RUN`] of these a due period has its turn. Of the due periods, the one that ends first goes
+//! first. A period that is not served keeps its end while those that are served get later ones, so an overloaded line
+//! serves all of them in turn.
 //!
-//! **A reply that may still come.** Each transmission without a reply leaves one outstanding until it comes or the
-//! exchange's `late` time has passed. Until then those exchanges of the peer wait whose replies could be taken for it,
-//! the same exchange among them. Nothing else waits.
+//! **Late replies.** Each transmission without a reply leaves one reply outstanding until it arrives or the exchange's
+//! `late` time has passed. Until then the exchanges of the peer whose replies could be mistaken for it wait, the same
+//! exchange among them. Nothing else waits.
 //!
-//! **A peer** is away when nothing was heard of it: when each of its exchanges with a period that used to be answered, or
-//! two of them, failed since; where none has a period, those without one count. It is then asked in the gaps between
-//! the others, in which its whole timeout fits, and at the latest when its wait is over. The wait grows to
-//! 2^[`LONGEST_WAIT`] timeouts, so a peer that never answers takes at most 1 part in 65 of the line. An exchange that is
-//! not answered while others of its peer are has a wait of its own.
+//! **A peer is away** if nothing was heard from it: since it was last heard, each of its periodic exchanges that used
+//! to be answered has failed, or two of them; if none is periodic, the others count. It is then probed in gaps between
+//! the others that are long enough for its whole timeout, and at the latest when its wait is over. The wait grows to
+//! 2^[`LONGEST_WAIT`] timeouts, so a peer that never answers takes at most 1 part in 65 of the line. An exchange that
+//! is not answered while others of its peer are has a wait of its own.
 //!
-//! **The start of a device.** What a peer is asked at its start comes before anything else that it is asked, in the
-//! order of the rows. Where another exchange with a period tells whether the peer is there, it waits until the peer is
-//! heard, or was not heard for its `absent` time. It is asked once, and again only when the peer has started: it said so,
-//! or it was away for its `absent` time.
+//! **Start of a device.** The start exchanges of a peer come before all its other exchanges, in the order of the rows.
+//! If another, periodic exchange shows whether the peer is up, they wait until the peer is heard, or was not heard for
+//! its `absent` time. They are sent once, and again only after the peer has started: it said so, or it was away for its
+//! `absent` time.
 
 use super::peer_counters::PeerCounters;
 use crate::modbus::rtu::Expected;
 use crate::schedule::{Grid, Presence};
 use crate::time::{Duration, Instant};
 
-/// Requested exchanges in a row while a period is due.
+/// Maximum number of requested exchanges in a row while a period is due.
 const REQUESTED_RUN: u8 = 4;
 /// The longest wait in timeouts, as a power of two.
 const LONGEST_WAIT: u8 = 6;
-/// No wait is longer than this, or than twice the timeout.
+/// No wait is longer than this, or than twice the timeout if that is more.
 const WAIT_LIMIT: Duration = Duration::from_secs(30);
 
-/// The exchanges of one line, and the peers that they are with.
+/// The exchanges of one line and their peers.
 #[derive(Debug)]
 pub(crate) struct Turns<'a> {
     pub rows: &'a mut [Row],
@@ -50,93 +50,93 @@ pub(crate) struct Row {
     pub peer: u8,
     kind: RowKind,
     grid: Option<Grid>,
-    /// A change, a write that stops, or a start of one that is also written again: wanted until it is answered.
-    /// [`Instant::NEVER`] if it is not, as with the other instants here.
+    /// When a change, a write that stops, or the start of a state was requested; it stays requested until it is
+    /// answered. Like the other instants here, [`Instant::NEVER`] if it is not.
     requested: Instant,
-    /// What is asked at the start, if that is all it is asked for.
+    /// Whether the start exchange is wanted, if it is sent for no other reason.
     start: Start,
     start_at: Instant,
     opens: Opens,
-    /// An event that is ready to be sent, since this instant.
+    /// Since when an event is ready to be sent.
     event: Instant,
-    /// When it was taken last.
+    /// When the row was last taken.
     taken: Instant,
     times: Times,
-    /// The rows of the line, as bits, whose answers could be taken for its reply.
+    /// The rows of the line, as bits, whose replies could be mistaken for its own.
     pub alike: u64,
-    /// How many replies to earlier transmissions may still come.
+    /// How many replies to earlier transmissions may still arrive.
     outstanding: u8,
-    /// Until then they may.
+    /// Until when they may arrive.
     outstanding_until: Instant,
-    /// Of a write that stops: replies to what was sent before it was wanted may come until then.
+    /// For a write that stops: until when replies to transmissions before the current request may arrive.
     former: Instant,
-    /// The reply that may come, on Modbus.
+    /// The reply that may arrive, on Modbus.
     pub expected: Option<Expected>,
     wait: Wait,
     /// It has been answered since the line began.
     was_answered: bool,
-    /// It was not answered since its peer was heard.
+    /// It was not answered since its peer was last heard.
     is_missed: bool,
-    /// What was sent last was neither confirmed nor refused: it may have been an echo.
+    /// The last request was neither confirmed nor refused: only its possible echo arrived.
     pub is_unconfirmed: bool,
 }
 
-/// What kind of exchange a row is.
+/// The kind of an exchange.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RowKind {
-    /// Whether it has a reply, which says that the peer is there.
+    /// Whether it has a reply, which shows that the peer is up.
     pub is_answered: bool,
-    /// It is asked at the start.
+    /// It is sent at the start of the peer.
     pub starts: bool,
-    /// It is also asked for other reasons, so the start is no event of its own.
+    /// It is also sent for other reasons, so the start is not separate.
     pub is_state: bool,
     /// It stops its peer.
     pub stops: bool,
-    /// Repetitions of a state, and of an event.
+    /// Maximum number of repetitions, of a state and of an event.
     pub retries: [u8; 2],
 }
 
 /// The times of a row.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Times {
-    /// Time on the line if no answer comes.
+    /// Time it takes on the line without a reply.
     pub cost: Duration,
     pub timeout: Duration,
-    /// How long after its request a reply may come.
+    /// How long after its request a reply may arrive.
     pub late: Duration,
-    /// The rest of the line behind it.
+    /// The pause of the line after it.
     pub pause: Duration,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Start {
-    /// It was carried out, or nobody knows; it is not asked.
+    /// Not wanted: it was executed, or may have been.
     Over,
     Wanted,
-    /// It was sent and nothing was heard since. At its instant the peer has been away long enough.
+    /// It was sent and nothing has been heard since; `start_at` is when the peer will have been away long enough.
     Unheard,
 }
 
-/// Whether the other exchanges of the peer wait, because this one comes first at its start.
+/// Whether the other exchanges of the peer wait because this one goes first at its start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Opens {
     No,
     Yes,
-    /// It was taken, and is not answered yet.
+    /// Its request was taken but is not answered yet.
     Taken,
 }
 
-/// How long to wait after failures, which doubles.
+/// The wait after failures, which doubles.
 #[derive(Debug, Clone, Copy)]
 struct Wait {
     failures: u8,
-    /// Not asked before.
+    /// Not sent before this.
     not_before: Instant,
-    /// The peer said that it is busy: events wait too.
+    /// The peer reported that it is busy: events wait too.
     is_busy: bool,
 }
 
-/// One peer of a line, and whether it answers.
+/// A peer of a line, and its availability.
 #[derive(Debug, Clone)]
 pub(crate) struct PeerState {
     /// Address of the slave, or number of the device.
@@ -145,11 +145,11 @@ pub(crate) struct PeerState {
     presence: Presence,
     /// It was heard since the line began.
     was_heard: bool,
-    /// Since when its requests are not answered, and until when that was seen.
+    /// When the first of its unanswered requests left, and when the newest failed.
     failing_since: Instant,
     failing_until: Instant,
     failures: u8,
-    /// Asked in a gap from here on, and in any case at the second instant.
+    /// From `not_before` on it is probed in a gap, at `nevertheless` in any case.
     not_before: Instant,
     nevertheless: Instant,
     missed: u32,
@@ -161,9 +161,9 @@ pub(crate) struct PeerState {
 pub(crate) enum Cause {
     /// An event, whose request was made when it happened.
     Event,
-    /// The start of the peer alone.
+    /// Only the start of the peer.
     Start,
-    /// A period, or a value that is wanted since this instant.
+    /// A period, or a request made at this instant.
     State(Option<Instant>),
 }
 
@@ -174,23 +174,23 @@ pub(crate) enum Ended {
     Good,
     /// The peer refused it for good.
     Refused,
-    /// The peer is doing it, and takes its time.
+    /// The peer accepted it and needs more time.
     Accepted,
-    /// The peer has not done it, because it is busy.
+    /// The peer did not execute it because it is busy.
     Busy,
-    /// The peer may have done it.
+    /// The peer may have executed it.
     Unclear,
-    /// What came may have been an echo.
+    /// Only its possible echo arrived.
     Unconfirmed,
 }
 
-/// What a failure, or a sign of life, means for the peer.
+/// What a failure or a sign of life changes for the peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum News {
     Nothing,
     /// The peer is away from now on.
     Away,
-    /// The peer has started: what is asked at its start is asked.
+    /// The peer has started: its start exchanges are due.
     Started,
 }
 
@@ -204,7 +204,7 @@ impl Wait {
     }
 }
 
-/// The wait behind so many failures.
+/// The wait after this many failures.
 fn wait(failures: u8, timeout: Duration) -> Duration {
     let longest = WAIT_LIMIT.max(timeout.saturating_mul(2));
     timeout.saturating_mul(1_u64.wrapping_shl(u32::from(failures.min(LONGEST_WAIT)))).min(longest)
@@ -227,7 +227,7 @@ impl PeerState {
         }
     }
 
-    /// It may be another one.
+    /// The peer may be another one now.
     fn forget(&mut self) {
         let (counters, missed) = (self.counters, self.missed);
         *self = Self { counters, missed, ..Self::new(self.number, self.absent) };
@@ -237,7 +237,7 @@ impl PeerState {
         self.presence
     }
 
-    /// Its periods that went by while it was there.
+    /// The periods that were missed while it was up.
     pub(crate) const fn missed(&self) -> u32 {
         self.missed
     }
@@ -253,7 +253,7 @@ impl PeerState {
             && self.failing_until.saturating_since(self.failing_since) >= self.absent
     }
 
-    /// It has said nothing for that time since the line began: perhaps it does not before it was started.
+    /// It was not heard for its `absent` time since the line began: perhaps it only responds once it is started.
     fn is_mute(&self) -> bool {
         !self.was_heard && self.was_absent()
     }
@@ -297,7 +297,7 @@ impl Row {
         self.kind.stops
     }
 
-    /// From when on it is to be sent, if it stops its peer and is wanted.
+    /// From when on it is to be sent, if it is a wanted write that stops its peer.
     pub(crate) fn stop_at(&self) -> Option<Instant> {
         (self.kind.stops && self.is_requested()).then(|| self.requested.max(self.wait.not_before))
     }
@@ -306,12 +306,12 @@ impl Row {
         self.requested != Instant::NEVER
     }
 
-    /// Wants it from now on, if it is not wanted yet.
+    /// Requests it from now on, unless it is already requested.
     fn request(&mut self, now: Instant) {
         self.requested = self.requested.min(now);
     }
 
-    /// Wants it again for the same reason, unless it is wanted for a newer one.
+    /// Requests it again for the same reason, unless there is a newer request.
     fn request_again(&mut self, requested: Option<Instant>) {
         if !self.is_requested() {
             self.requested = requested.unwrap_or(Instant::NEVER);
@@ -334,7 +334,7 @@ impl Row {
         self.times.pause
     }
 
-    /// How often a request for this reason is repeated.
+    /// Maximum number of repetitions of a request with this cause.
     pub(crate) const fn retries(&self, cause: Cause) -> u8 {
         let [of_state, of_event] = self.kind.retries;
         match cause {
@@ -343,31 +343,31 @@ impl Row {
         }
     }
 
-    /// Whether a reply to an earlier transmission may still come.
+    /// Whether a reply to an earlier transmission may still arrive.
     pub(crate) fn is_outstanding(&self, now: Instant) -> bool {
         self.outstanding > 0 && self.outstanding_until > now
     }
 
-    /// So many replies may come until this instant.
+    /// This many replies may arrive until this instant.
     pub(crate) fn leaves_outstanding(&mut self, count: u8, until: Instant, now: Instant) {
         let before = if self.is_outstanding(now) { self.outstanding } else { 0 };
         self.outstanding = before.saturating_add(count);
         self.outstanding_until = self.outstanding_until.max(until);
     }
 
-    /// One of the replies that were outstanding has come.
+    /// One of the outstanding replies has arrived.
     pub(crate) fn late_reply_came(&mut self) {
         self.outstanding = self.outstanding.saturating_sub(1);
     }
 
-    /// The line begins anew: what is asked at the start is asked again, and periods begin now. What was asked before
-    /// is not known, and may be answered now.
+    /// The line begins anew: start exchanges are due, and periods begin now. Earlier requests are unknown and may still
+    /// be answered.
     fn begin(&mut self, now: Instant) {
         self.start_over(now);
         (self.event, self.expected) = (Instant::NEVER, None);
         (self.wait, self.was_answered, self.is_missed) = (Wait::NONE, false, false);
         self.is_unconfirmed = false;
-        // Nobody knows how many: they are pending until the end.
+        // Their number is unknown, so they stay outstanding until the end.
         let count = if self.kind.is_answered { u8::MAX } else { 0 };
         (self.outstanding, self.outstanding_until) = (count, now + self.times.late);
         if let Some(grid) = &mut self.grid {
@@ -375,7 +375,7 @@ impl Row {
         }
     }
 
-    /// What is asked at the start is asked.
+    /// Makes a start exchange due.
     fn start_over(&mut self, now: Instant) {
         if !self.kind.starts {
             return;
@@ -388,24 +388,24 @@ impl Row {
         }
     }
 
-    /// Since when it is wanted beside its period.
+    /// Since when it is requested apart from its period.
     fn requested_at(&self) -> Instant {
         self.requested.min(self.start_at)
     }
 
-    /// Since when the row is to be taken, or from when; of one without an event that is ready.
+    /// When it is, or was, to be taken, apart from events.
     fn wanted(&self) -> Instant {
         self.grid.as_ref().map_or(Instant::NEVER, Grid::next).min(self.requested_at())
     }
 
-    /// When the period that is due, or the next one, is missed.
+    /// The end of the due or next period, when it is missed.
     fn end_of_period(&self) -> Instant {
         self.grid.as_ref().map_or(Instant::NEVER, |grid| grid.next() + grid.period())
     }
 }
 
 impl Turns<'_> {
-    /// Wants a row until it is answered.
+    /// Requests a row until it is answered.
     pub(crate) fn request(&mut self, nth: usize, now: Instant) {
         if let Some(row) = self.rows.get_mut(nth) {
             if !row.is_requested() {
@@ -415,7 +415,7 @@ impl Turns<'_> {
         }
     }
 
-    /// The request of an event is ready, or is not sent any more.
+    /// The request of an event is ready, or is no longer to be sent.
     pub(crate) fn set_event(&mut self, nth: usize, event: Option<Instant>) {
         if let Some(row) = self.rows.get_mut(nth) {
             row.event = event.unwrap_or(Instant::NEVER);
@@ -429,8 +429,8 @@ impl Turns<'_> {
         *self.run = 0;
     }
 
-    /// The connection to the peers is lost, and perhaps a row's request with it: it was not answered. How long they
-    /// stay away counts from here.
+    /// The connection to the peers is lost, and with it perhaps a row's request: it was not answered. The peers' time
+    /// away counts from now.
     pub(crate) fn lost(&mut self, row: Option<(usize, Cause)>, now: Instant) {
         if let Some((nth, cause)) = row {
             self.failed(nth, cause, now, now);
@@ -442,7 +442,7 @@ impl Turns<'_> {
         }
     }
 
-    /// The connection is there again: periods begin now, and nobody has to wait.
+    /// The connection is up again: periods begin now, and all waits end.
     pub(crate) fn resume(&mut self, now: Instant) {
         for row in &mut *self.rows {
             (row.event, row.wait) = (Instant::NEVER, Wait::NONE);
@@ -462,7 +462,7 @@ impl Turns<'_> {
         self.rows.iter().any(|row| row.peer == which && row.stop_at().is_some())
     }
 
-    /// The row to take now, or when to look again.
+    /// The row to take now, or when to check again.
     pub(crate) fn choose(&mut self, now: Instant) -> Result<usize, Instant> {
         let (mut stop, mut event) = (First::NONE, First::NONE);
         let (mut requested, mut due, mut probe, mut overdue) =
@@ -536,7 +536,7 @@ impl Turns<'_> {
         }
     }
 
-    /// When no reply is outstanding any more that could be taken for one to this row.
+    /// When no outstanding reply can be mistaken for one to this row any more.
     fn free_at(&self, row: &Row, now: Instant) -> Instant {
         if row.alike == 0 {
             return Instant::ZERO;
@@ -545,7 +545,7 @@ impl Turns<'_> {
         let others = rows.filter(|(other, nth)| {
             other.is_outstanding(now) && other.peer == row.peer && row.alike.unbounded_shr(*nth) & 1 != 0
         });
-        // Whichever of the transmissions of a stop is answered, the peer has stopped since it was wanted.
+        // Whichever transmission of a stop is answered, the peer has stopped since it was requested.
         let until = |other: &Row| match row.kind.stops && core::ptr::eq(other, row) {
             true => row.former,
             false => other.outstanding_until,
@@ -553,12 +553,12 @@ impl Turns<'_> {
         others.map(|(other, _)| until(other)).max().unwrap_or(Instant::ZERO)
     }
 
-    /// Whether another reply may come that could be taken for one to this row.
+    /// Whether another reply may arrive that could be mistaken for one to this row.
     pub(crate) fn is_ambiguous(&self, nth: usize, now: Instant) -> bool {
         self.rows.get(nth).is_some_and(|row| self.free_at(row, now) > now)
     }
 
-    /// Whether another row of the peer is to be asked at its start before this one.
+    /// Whether another start exchange of the peer has to come before this row.
     fn waits_for_opening(&self, nth: usize, row: &Row) -> bool {
         let is_away = self.peers.get(usize::from(row.peer)).is_some_and(|peer| peer.is_away());
         let comes = |other: &Row| {
@@ -571,8 +571,8 @@ impl Turns<'_> {
         first.is_some_and(|first| first != nth)
     }
 
-    /// Whether a start waits until its peer is heard, because another row will tell: one that is sent to a peer that is
-    /// perhaps away may be carried out without a reply, and once more when the peer is heard.
+    /// Whether a start exchange waits until its peer is heard, because another row will show that. Sent to a peer that
+    /// may be away, it might be executed without a reply, and again once the peer is heard.
     fn start_waits(&self, row: &Row) -> bool {
         let tells = |other: &Row| other.peer == row.peer && other.kind.is_answered && other.grid.is_some();
         let turn = self.peers.get(usize::from(row.peer));
@@ -584,7 +584,7 @@ impl Turns<'_> {
         waits && self.rows.iter().any(tells)
     }
 
-    /// The row is taken: its request is being sent, or there is nothing to send.
+    /// Takes the row: its request is sent now, or there is nothing to send.
     pub(crate) fn take(&mut self, nth: usize, now: Instant) -> Cause {
         let Some(row) = self.rows.get_mut(nth) else { return Cause::State(None) };
         row.taken = now;
@@ -610,11 +610,11 @@ impl Turns<'_> {
         cause
     }
 
-    /// A row that was taken was not sent: a value of it is missing.
+    /// A row that was taken was not sent, because one of its values is missing.
     pub(crate) fn not_sent(&mut self, nth: usize, cause: Cause, now: Instant) {
         let Some(row) = self.rows.get_mut(nth) else { return };
         match cause {
-            // Without `opens`: the others need not wait for its values.
+            // `opens` is not set: the others need not wait for its values.
             Cause::Start => row.set_start(Start::Wanted, now + row.times.timeout),
             Cause::State(Some(_)) if row.kind.stops => {
                 row.request(now);
@@ -624,7 +624,7 @@ impl Turns<'_> {
         }
     }
 
-    /// A request ended with an answer of the peer.
+    /// A request ended with a reply of the peer.
     pub(crate) fn answered(&mut self, nth: usize, cause: Cause, ended: Ended, now: Instant) -> News {
         let Some(row) = self.rows.get_mut(nth) else { return News::Nothing };
         let which = row.peer;
@@ -635,7 +635,7 @@ impl Turns<'_> {
                 row.wait.longer(row.times.timeout, now, ended == Ended::Busy);
                 match cause {
                     Cause::State(requested) => row.request_again(requested),
-                    // It was not carried out.
+                    // It was not executed.
                     Cause::Start if ended == Ended::Busy => row.set_start(Start::Wanted, now),
                     Cause::Start | Cause::Event => {}
                 }
@@ -643,7 +643,7 @@ impl Turns<'_> {
             Ended::Unconfirmed => row.is_unconfirmed = true,
         }
         if row.kind.stops && ended != Ended::Good && ended != Ended::Accepted {
-            // A stop is wanted until it is confirmed, whatever a refusal says.
+            // A stop is requested until it is confirmed, even after a refusal.
             row.request(now);
             row.wait.not_before = now + row.times.timeout;
         }
@@ -653,7 +653,7 @@ impl Turns<'_> {
         self.heard(which, Some(nth), now)
     }
 
-    /// A sign of life of a peer, beside the row whose reply it is.
+    /// A sign of life of a peer. `own` is the row whose reply it is, if any.
     pub(crate) fn heard(&mut self, which: u8, own: Option<usize>, now: Instant) -> News {
         let Some(peer) = self.peers.get_mut(usize::from(which)) else { return News::Nothing };
         let was_away = peer.is_away();
@@ -662,12 +662,12 @@ impl Turns<'_> {
         peer.failing_since = Instant::NEVER;
         for row in self.rows.iter_mut().filter(|row| row.peer == which) {
             row.is_missed = false;
-            // Its request, or the reply, was lost; nobody knows which.
+            // Its request or the reply was lost; it is unknown which.
             if row.start == Start::Unheard {
                 row.set_start(Start::Over, Instant::NEVER);
             }
             if was_away && let Some(grid) = &mut row.grid {
-                // What went by in the meantime is not missed.
+                // Periods that passed while the peer was away are not missed.
                 *grid = Grid::starting_at(grid.next().max(now), grid.period());
             }
         }
@@ -678,8 +678,8 @@ impl Turns<'_> {
         News::Started
     }
 
-    /// The peer has started: what is asked at its start is asked, but for a row that was just answered, unless
-    /// another one has to come before it.
+    /// The peer has started: its start exchanges are due, except a row that was just answered, unless another one has
+    /// to come before it.
     pub(crate) fn started(&mut self, which: u8, own: Option<usize>, now: Instant) {
         let starts = |row: &Row| row.peer == which && row.kind.starts;
         let first = self.rows.iter().position(starts);
@@ -690,7 +690,7 @@ impl Turns<'_> {
         }
     }
 
-    /// The peer has not answered a request that left first at `sent`.
+    /// The peer has not answered a request that first left at `sent`.
     pub(crate) fn failed(&mut self, nth: usize, cause: Cause, now: Instant, sent: Instant) -> News {
         let Some(row) = self.rows.get_mut(nth) else { return News::Nothing };
         let (timeout, which) = (row.times.timeout, row.peer);
@@ -698,7 +698,7 @@ impl Turns<'_> {
             return News::Nothing;
         };
         if row.opens == Opens::Taken {
-            // A state is still to come first. Whether the start of its own was heard, nobody knows.
+            // A state still has to come first. A pure start may have been received.
             row.opens = if cause == Cause::Start { Opens::No } else { Opens::Yes };
         }
         match cause {
@@ -708,7 +708,7 @@ impl Turns<'_> {
         }
         row.wait.longer(timeout, now, false);
         if row.stop_at().is_some() {
-            // Others have a turn, no more.
+            // A stop waits no longer than for one turn of the others.
             row.wait.not_before = now + timeout;
         }
         row.is_missed = true;
@@ -728,7 +728,7 @@ impl Turns<'_> {
         peer.presence = Presence::Down;
         peer.not_before = now + Duration::from_micros(wait.as_micros() / 2);
         peer.nevertheless = now + wait;
-        // The peer's wait is counted from its failures; those of one exchange are not its own fault.
+        // The peer's own wait counts its failures; the waits of single exchanges are for peers that respond.
         for row in self.rows.iter_mut().filter(|row| row.peer == which && !row.kind.stops) {
             row.wait = Wait::NONE;
         }
@@ -739,27 +739,27 @@ impl Turns<'_> {
     fn is_silent(&self, which: u8) -> bool {
         let rows = || self.rows.iter().filter(|row| row.peer == which && row.kind.is_answered);
         let was_answered = rows().any(|row| row.was_answered);
-        // One that never was does not say anything while others were.
+        // An exchange that was never answered says nothing while others were.
         let deciding = || rows().filter(|row| row.was_answered || !was_answered);
-        // Nor does one that is asked now and then while others have a period: they will tell.
+        // Nor does an occasional one if others are periodic: those will tell.
         let has_period = deciding().any(|row| row.grid.is_some());
         let deciding = || deciding().filter(|row| row.grid.is_some() || !has_period);
         let (all, missed) = (deciding().count(), deciding().filter(|row| row.is_missed).count());
         missed >= all.min(2) && missed > 0
     }
 
-    /// Whether a peer is away, and is asked with a period, so that its return is noticed. Nothing tells whether one that
-    /// is only asked when something happens is still away.
+    /// Whether a peer is away and has a periodic exchange, which will notice its return. Without one, nothing shows
+    /// whether it is still away.
     pub(crate) fn is_known_to_be_away(&self, which: u8) -> bool {
         let is_asked = |row: &Row| row.peer == which && row.kind.is_answered && row.grid.is_some();
         self.peers.get(usize::from(which)).is_some_and(PeerState::is_away) && self.rows.iter().any(is_asked)
     }
 }
 
-/// The row with the smallest key; the first of several.
+/// The row with the smallest key; the first one if several have it.
 #[derive(Clone, Copy)]
 struct First {
-    /// What decides, and when the row was taken last.
+    /// What decides, and when the row was last taken.
     key: (Instant, Instant),
     nth: Option<usize>,
 }
