@@ -1,9 +1,8 @@
 //! The links to port 2000: commands that field values pick (docs/engine.md section 7).
 //!
-//! A command is sent once or not at all. A command that cannot be sent soon is dropped, and the
-//! port's reply code ([`Outcomes`]) says so: a robot must not start later because a button was
-//! pressed earlier. A command that stops the robot has its own connection, goes ahead of
-//! everything, and is not dropped while its device asks for it.
+//! A command is sent once or not at all. A command that cannot be sent soon is dropped, and the port's reply code
+//! ([`Outcomes`]) says so: a robot must not start late because a button was pressed earlier. A command that stops the
+//! robot has its own connection, goes ahead of everything, and is not dropped while its device asks for it.
 
 use heapless::{Deque, Vec};
 
@@ -25,19 +24,18 @@ use crate::wire::scalar::Scalar;
 
 /// A command that is not acknowledged this long after it was picked is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
-/// Two losses of the second connection within this time mean that the controller takes only one
-/// (D26).
+/// Two losses of the second connection within this time mean that the controller accepts only one (D26).
 const STRIKES_WITHIN: Duration = Duration::from_secs(10);
-/// Within this time a lost connection is open again, or another one is given up for a stop.
+/// A lost connection normally reopens within this time; until then no other is given up for a stop.
 const OPEN_AGAIN: Duration = Duration::from_millis(500);
-/// Replies that are about to be handled may make room for a stop that was just picked.
+/// Replies that arrive within this time may make room for a stop that was just picked.
 const ROOM_WITHIN: Duration = Duration::from_millis(20);
 /// A second loss within this time has the same cause as the first.
 const TOGETHER: Duration = Duration::from_secs(1);
 
 #[derive(Debug, Clone)]
 pub(crate) struct CommandLink {
-    /// The connection for everything, and the one for urgent commands alone.
+    /// The connection for all commands; `urgent`: the one for urgent commands only.
     pub ordinary: Session,
     pub urgent: Option<Session>,
     port: u16,
@@ -46,26 +44,26 @@ pub(crate) struct CommandLink {
     fields: Vec<CommandField, MAX_COMMAND_FIELDS>,
     queue: Deque<Waiting, COMMAND_QUEUE>,
     stops: Stops,
-    /// The frame that is being applied has picked an urgent command.
+    /// The frame being applied has picked an urgent command.
     stops_now: bool,
     /// Number of commands at the front of the queue that an urgent command has overtaken.
     overtaken: usize,
-    /// When the second connection, or the first because of it, was lost last.
+    /// When the second connection was last lost, or the first because of it.
     struck_at: Option<Instant>,
     /// Until then no connection is given up for a stop that cannot be sent.
     way_made_until: Instant,
     /// The newest command that each port's values picked, and the value.
     picked: [Option<(u16, i64)>; MAX_PORTS],
-    /// Likewise the newest value that gave no command.
+    /// The newest value of each port that gave no command.
     dropped: [Option<DroppedCommand>; MAX_PORTS],
     /// Commands that the controller replied to with a failure.
     pub failed: FailedCommands,
-    /// Results of commands since the engine asked last.
+    /// Results of commands that the engine has not taken yet.
     pub outcomes: Outcomes,
 }
 
 impl CommandLink {
-    /// Links with these command tables; `None` if their texts are too long together.
+    /// `None` if the command texts are too long in total.
     pub(crate) fn new(port: u16, dialect: Dialect, entries: &[CommandEntry]) -> Option<Self> {
         let tables = Tables::new(entries)?;
         let stops = tables.has_urgent();
@@ -95,7 +93,7 @@ impl CommandLink {
         self.text(entry, value)
     }
 
-    /// The newest text of a connection that no command got as its reply.
+    /// The newest text on a connection that was not the reply to a command.
     pub(crate) fn other_text_of<'a>(&'a self, session: &'a Session) -> Option<OtherText<'a>> {
         let last = session.last_text.as_ref()?;
         let command = last.entry.and_then(|entry| self.text(entry, last.value));
@@ -116,7 +114,7 @@ impl CommandLink {
         Transport::Tcp { port: self.port }
     }
 
-    /// Adds a field and returns its index, or `None` if there are too many.
+    /// Adds a field and returns its index; `None` if there are too many.
     pub(crate) fn add_field(&mut self, table: Span, when: CommandWhen, place: (u8, u8)) -> Option<u8> {
         let index = self.fields.len() as u8;
         let names_idle = self.tables.names_idle(table);
@@ -124,9 +122,8 @@ impl CommandLink {
         Some(index)
     }
 
-    /// An accepted frame brought a value of a command field. If it picks a command, that is `port`'s
-    /// `nth`, and what is known at once about it is returned: it waits, or is not sent.
-    /// [`Self::frame_ends`] and [`Self::drop_overtaken`] follow.
+    /// Takes the value of a command field in an accepted frame. A picked command becomes `port`'s `nth`; the result
+    /// says whether it waits or is not sent. [`Self::frame_ends`] and [`Self::drop_overtaken`] follow.
     pub(crate) fn value(
         &mut self,
         field: u8,
@@ -158,7 +155,7 @@ impl CommandLink {
         if len == 0 {
             return Picked::Nothing;
         }
-        // The press of a stop button may be among what was discarded after sleep; a stop too many does no harm.
+        // The press of a stop button may be among the input discarded after sleep; an extra stop does no harm.
         let is_held_stop = woke && keyword.is_urgent();
         if !acts && !is_held_stop {
             self.tell(port, DropReason::Based, (field, value), now);
@@ -173,7 +170,7 @@ impl CommandLink {
             return Picked::Command { reply: ReplyCode::Pending, is_dropped: false };
         }
         if self.stops_now {
-            // Whatever the order of the fields, the port tells what becomes of the stop.
+            // Whatever the order of the fields, the port reports the result of the stop.
             self.stops.stays_newest(port, nth);
             waiting.nth = nth.wrapping_sub(1);
         } else {
@@ -191,7 +188,7 @@ impl CommandLink {
         Picked::Command { reply, is_dropped }
     }
 
-    /// The command is the newest that its port's values picked.
+    /// Notes the newest command that its port's values picked.
     fn is_newest(&mut self, command: &Waiting) {
         if let Some(newest) = self.picked.get_mut(usize::from(command.port.0)) {
             *newest = Some((command.entry, command.value));
@@ -206,21 +203,20 @@ impl CommandLink {
         }
     }
 
-    /// A command that waited is not sent.
+    /// Drops a command that waited.
     fn drop_command(&mut self, command: Waiting, why: DropReason, now: Instant) {
         self.tell(command.port, why, (command.field, command.value), now);
         self.outcomes.push(command, ReplyCode::NotSent);
     }
 
-    /// All other commands than urgent ones that wait are not sent.
+    /// Drops all waiting commands that are not urgent.
     fn drop_queue(&mut self, why: DropReason, now: Instant) {
         while let Some(waiting) = self.queue.pop_front() {
             self.drop_command(waiting, why, now);
         }
     }
 
-    /// All fields of a frame have been handled: an urgent command overtakes the rest, whatever
-    /// their order.
+    /// All fields of a frame have been handled: an urgent command overtakes the others whatever their order.
     pub(crate) fn frame_ends(&mut self) {
         if core::mem::take(&mut self.stops_now) {
             self.overtaken = self.queue.len();
@@ -252,12 +248,12 @@ impl CommandLink {
         }
     }
 
-    /// The device is gone: its waiting commands are dropped.
+    /// Drops the waiting commands of devices that are gone.
     pub(crate) fn drop_forgotten(&mut self, now: Instant) {
         for _ in 0..self.queue.len() {
             let Some(waiting) = self.queue.pop_front() else { return };
             let is_there = self.fields.get(usize::from(waiting.field)).is_some_and(|f| f.last.is_some());
-            // The queue has moved up by one.
+            // Cannot fail: the queue has just lost one.
             if !is_there || self.queue.push_back(waiting).is_err() {
                 self.drop_command(waiting, DropReason::DeviceGone, now);
             }
@@ -292,7 +288,7 @@ impl CommandLink {
             {
                 self.strike(now);
             }
-            // Both were lost together: this says nothing about the second one.
+            // Both were lost together, which says nothing about the second one.
             (LinkId::COMMAND, LinkState::Up { .. }, _) | (LinkId::URGENT, _, Some(LinkState::Up { .. })) => {
                 self.struck_at = self.struck_at.filter(|&at| now.saturating_since(at) > TOGETHER);
             }
@@ -312,7 +308,7 @@ impl CommandLink {
         }
     }
 
-    /// The controller was away: another one may be in its place.
+    /// The controller was away: it may have been replaced by another one.
     fn was_away(&mut self, now: Instant) {
         self.struck_at = None;
         if let Some(urgent) = &mut self.urgent {
@@ -320,19 +316,17 @@ impl CommandLink {
         }
     }
 
-    /// A connection is gone: what waited for it is not sent later, except a stop that its device
-    /// still asks for.
+    /// A connection is gone: what waited for it is not sent later, except a stop that its device still asks for.
     fn lost(&mut self, link: LinkId, now: Instant) {
         let Some(session) = self.session(link) else { return };
         let [first, beside] = session.lost();
         if first.is_some() {
             self.no_way_before(now + OPEN_AGAIN);
         }
-        // Of two commands of a kind the newer one is sent again: its result is the one that is
-        // shown.
+        // Of two commands of the same kind the newer one is sent again, because its result is the one shown.
         for sent in [beside, first].into_iter().flatten() {
             if sent.has_text {
-                // It has arrived, and sending it again would say the same once more.
+                // The command has arrived; sending it again would give the same reply.
                 self.outcomes.push(sent.command, ReplyCode::Other);
             } else if sent.keyword.is_urgent() && is_asked(&self.fields, &sent.command) {
                 self.stops.push_again(sent.keyword, Waiting { since: now, ..sent.command });
@@ -349,8 +343,8 @@ impl CommandLink {
         self.way_made_until = self.way_made_until.max(at);
     }
 
-    /// The gateway itself slept: commands picked before are dropped. A stop is picked again by the next value, if
-    /// the device still asks for it.
+    /// The gateway itself slept: drops commands picked before. The next value picks a stop again if the device still
+    /// asks for it.
     pub(crate) fn slept(&mut self, now: Instant) {
         self.fields.iter_mut().for_each(CommandField::slept);
         self.drop_queue(DropReason::Asleep, now);
@@ -379,13 +373,13 @@ impl CommandLink {
         }
     }
 
-    /// Bytes arrived on a connection. Returns whether it is up.
+    /// Notes bytes that arrived on a connection. Returns whether it is up.
     pub(crate) fn heard(&mut self, link: LinkId, len: usize, now: Instant) -> bool {
         let session = self.session(link).filter(|session| session.supervisor.is_up());
         session.map(|session| session.heard(len, now)).is_some()
     }
 
-    /// Replies from the controller.
+    /// Takes replies from the controller.
     pub(crate) fn received(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
         if let Some(session) = self.session(link) {
             let in_time = session.in_time(now);
@@ -393,7 +387,7 @@ impl CommandLink {
         }
     }
 
-    /// Handles the clock: replies completed by silence, timeouts, commands that waited too long.
+    /// Handles what is due: replies completed by silence, timeouts, commands that waited too long.
     pub(crate) fn advance(&mut self, now: Instant) {
         for link in [LinkId::URGENT, LinkId::COMMAND] {
             let Some(session) = self.session(link) else { continue };
@@ -409,13 +403,13 @@ impl CommandLink {
         if let Some((link, at)) = self.crowded()
             && now >= at
         {
-            // The peer does not answer: a new connection is open before a reply can be expected.
+            // The peer does not reply: reopening the connection is faster than waiting.
             if let Some(session) = self.session(link) {
                 session.supervisor.give_up(now);
             }
             self.lost(link, now);
         }
-        // A change of the first connection may open the second at once.
+        // In this order, because a change of the first connection may open the second.
         for link in [LinkId::COMMAND, LinkId::URGENT] {
             self.supervise(link, now);
         }
@@ -430,13 +424,13 @@ impl CommandLink {
         }
     }
 
-    /// Opens a connection again when it is due. One that did not open in time tells whether the
-    /// controller takes two.
+    /// Reopens a connection when it is due. A connection that fails to open in time shows whether the controller
+    /// accepts two.
     fn supervise(&mut self, link: LinkId, now: Instant) {
         let ordinary_is_up = self.ordinary.supervisor.is_up();
         let Some(session) = self.session(link) else { return };
         let was_opening = matches!(session.supervisor.state(), LinkState::Opening { .. });
-        // Silence is normal here, so a connection that is up is never given up for it.
+        // Silence is normal here, so a connection that is up is not given up for it.
         session.supervisor.advance(now);
         if was_opening && matches!(session.supervisor.state(), LinkState::Down { .. }) {
             match link {
@@ -486,26 +480,26 @@ impl CommandLink {
         self.ordinary.is_free_beside().then_some(LinkId::COMMAND)
     }
 
-    /// The next urgent command of a kind that is not in flight, or for so long that nobody knows its end.
+    /// The next urgent command of a kind that is not in flight, or has been for so long that its result is uncertain.
     fn pop_stop(&mut self, now: Instant) -> Option<(Keyword, Waiting)> {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
         self.stops.pop(|keyword| may_go_at(sessions, keyword) <= now)
     }
 
-    /// When one of the waiting urgent commands may be sent, if a connection can take it.
+    /// When the first waiting urgent command may be sent, if a connection can take it.
     fn stop_may_go_at(&self) -> Instant {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()];
         self.stops.kinds().map(|keyword| may_go_at(sessions, keyword)).min().unwrap_or(Instant::NEVER)
     }
 
-    /// If an urgent command waits only for replies, and has waited long enough: the connection
-    /// whose newest command has been unanswered longest.
+    /// If an urgent command has waited long enough, and only for replies: the connection whose newest command has been
+    /// unanswered longest, and when to give it up.
     fn crowded(&self) -> Option<(LinkId, Instant)> {
         let has_room = self.ordinary.supervisor.is_up() && self.ordinary.beside.is_none();
         if has_room || self.stops.is_empty() || self.way_of_stops().is_some() {
             return None;
         }
-        // Nothing is in flight on a connection that is not up.
+        // Nothing is in flight on a connection that is down.
         let urgent = self.urgent.as_ref().and_then(|session| session.in_flight);
         let urgent = urgent.map(|sent| (LinkId::URGENT, sent.at));
         let ordinary = self.ordinary.beside.map(|sent| (LinkId::COMMAND, sent.at));
@@ -525,7 +519,7 @@ impl CommandLink {
             && self.ordinary.is_unacknowledged()
             && self.ordinary.in_flight.is_some_and(is_ordinary)
         {
-            // A command in flight there could arrive after this one and start the robot again.
+            // A command in flight there could arrive after this one and restart the robot.
             self.ordinary.supervisor.give_up(times.0);
             self.lost(LinkId::COMMAND, times.0);
         }
@@ -536,7 +530,7 @@ impl CommandLink {
         let (entry, text) = self.tables.entry(command.1.entry)?;
         let sent = match entry.has_value {
             false => session.send(command, text, &self.dialect, out, times).ok(),
-            // The configuration was refused if the text were too long.
+            // Not too long: validation has refused such configurations.
             true => fill_in(text, command.1.value)
                 .and_then(|text| session.send(command, &text, &self.dialect, out, times).ok()),
         };
@@ -546,8 +540,8 @@ impl CommandLink {
         sent
     }
 
-    /// Whether an urgent command waits or may not have arrived. One that the controller has answered in
-    /// unknown words holds back no other any more.
+    /// Whether an urgent command waits or may not have arrived. A command that the controller has answered with an
+    /// unknown text no longer holds back others.
     fn is_stopping(&self) -> bool {
         let holds = |sent: &Sent| sent.keyword.is_urgent() && !sent.has_text;
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
@@ -555,7 +549,7 @@ impl CommandLink {
         !self.stops.is_empty() || sent.any(|sent| holds(&sent))
     }
 
-    /// When something happens without an input. An event on one connection may concern the other.
+    /// When something is due without an input. An event on one connection may concern the other.
     pub(crate) fn deadline(&self) -> Instant {
         let sessions = [Some(&self.ordinary), self.urgent.as_ref()].into_iter().flatten();
         let own = sessions.map(|session| session.deadline().min(session.supervisor.deadline()));
@@ -582,7 +576,7 @@ impl CommandLink {
         }
     }
 
-    /// Takes the events in `rest`, or those that the clock has completed.
+    /// Takes the events in `bytes`, or those that are due.
     fn take(&mut self, link: LinkId, bytes: &[u8], now: Instant) {
         let mut rest = bytes;
         loop {
@@ -595,7 +589,7 @@ impl CommandLink {
                     self.outcomes.push(sent.command, code);
                 }
                 Some(Event::TimedOut) => {
-                    // A late reply would be taken for that of the next command.
+                    // A late reply would be taken for the next command's.
                     session.supervisor.give_up(now);
                     self.lost(link, now);
                     return;

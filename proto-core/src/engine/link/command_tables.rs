@@ -1,7 +1,6 @@
-//! Tables of commands: which command a field's value picks, and its text.
+//! Command tables: which command a field's value picks, and its text.
 //!
-//! In: the tables of the configuration, and values. Out: entries. Does not know when a command is
-//! sent.
+//! In: the tables of the configuration, and values. Out: entries. Does not know when a command is sent.
 
 use heapless::{String, Vec};
 
@@ -18,24 +17,24 @@ pub(crate) const MAX_COMMAND_BYTES: usize = 1024;
 pub(crate) struct CommandField {
     pub table: Span,
     pub when: CommandWhen,
-    /// The value in the previous frame; none after silence.
+    /// The value in the previous frame; `None` after silence.
     pub last: Option<i64>,
     /// Index of its input frame, and its index in the frame.
     pub place: (u8, u8),
-    /// The gateway has slept since the value in the previous frame: what changed it may have been discarded.
+    /// The gateway has slept since the previous frame's value: the change may have been discarded.
     pub woke: bool,
-    /// The table names the values that pick nothing; otherwise it is 0.
+    /// The table has entries that pick nothing; otherwise the value 0 picks nothing.
     pub names_idle: bool,
 }
 
 impl CommandField {
-    /// Its frame is overdue: the next value only sets the base, unless the field keeps it, because its device sends
-    /// only changes. Whether there was one and is none.
+    /// The frame is overdue: the next value only sets the base, except in a field that keeps its base because the
+    /// device sends only changes. Returns whether a base was lost.
     pub(crate) fn silent(&mut self) -> bool {
         self.when != CommandWhen::Kept && self.last.take().is_some()
     }
 
-    /// Its device is gone: the next value only sets the base. Whether there was one.
+    /// The device is gone: the next value only sets the base. Returns whether there was a base.
     pub(crate) fn forget(&mut self) -> bool {
         self.woke = false;
         self.last.take().is_some()
@@ -47,18 +46,18 @@ impl CommandField {
     }
 }
 
-/// What a field's value leads to.
+/// The result of a field's value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Picked {
     Nothing,
-    /// The table does not have the value.
+    /// The value is not in the table.
     Unknown,
-    /// It would pick a command, but there is no value before it.
+    /// The value would pick a command, but there is no base.
     Based,
-    /// One more command of the port, with the reply code until its result is known.
+    /// The port's next command, with its reply code until the result is known.
     Command {
         reply: ReplyCode,
-        /// It will not be sent, and there is no further result.
+        /// It will not be sent, and no other result follows.
         is_dropped: bool,
     },
 }
@@ -67,7 +66,7 @@ pub(crate) enum Picked {
 #[derive(Debug, Clone)]
 pub(crate) struct Tables {
     entries: Vec<Entry, MAX_COMMANDS>,
-    /// The texts of all entries, one after the other.
+    /// The texts of all entries, concatenated.
     texts: String<MAX_COMMAND_BYTES>,
 }
 
@@ -90,7 +89,7 @@ impl Tables {
         for entry in entries {
             let start = tables.texts.len() as u16;
             tables.texts.push_str(&entry.text).ok()?;
-            // Validation has refused everything that is not a command.
+            // Cannot fail: validation has refused texts that are not commands.
             let keyword = Request::parse(entry.text.as_bytes()).map_or(Keyword::State, |r| r.keyword());
             let &CommandEntry { first, last, .. } = entry;
             let (len, has_value) = (entry.text.len() as u16, placeholders(&entry.text) > 0);
@@ -113,7 +112,7 @@ impl Tables {
         (table.start..).zip(table.of(&self.entries)).find(|(_, entry)| has(entry))
     }
 
-    /// Whether the table names values that pick nothing.
+    /// Whether the table has entries that pick nothing.
     pub(crate) fn names_idle(&self, table: Span) -> bool {
         table.of(&self.entries).iter().any(|entry| entry.len == 0)
     }
@@ -124,7 +123,7 @@ impl Tables {
     }
 }
 
-/// Whether the field of a command still has the value that picked it.
+/// Whether the field that picked a command still has the same value.
 pub(crate) fn is_asked(fields: &[CommandField], waiting: &Waiting) -> bool {
     fields.get(usize::from(waiting.field)).and_then(|field| field.last) == Some(waiting.value)
 }

@@ -1,5 +1,5 @@
-//! What the links that are one connection each have in common. Their supervisor decides when the
-//! connection is opened and given up; the command link, which has two, decides for both by itself.
+//! What links with one connection have in common. Their supervisor decides when to open the connection and when to give
+//! it up; the command link has two connections and decides for both itself.
 
 use crate::engine::values::store::Store;
 use crate::time::Instant;
@@ -8,23 +8,23 @@ pub(crate) trait Connection {
     /// The connection came up.
     fn opened(&mut self, store: &mut Store);
 
-    /// The connection is gone, and with it what was under way.
+    /// The connection is gone, and with it what was in flight.
     fn lost(&mut self, store: &mut Store);
 
-    /// Bytes, or one datagram, from the controller. When the image is looked at after each frame, only
-    /// the first frame is taken; the bytes behind it are left.
+    /// Takes bytes, or one datagram, from the controller. If the image has to be checked after each frame, only the
+    /// first frame is taken, and the bytes after it are returned.
     fn received<'b>(&mut self, bytes: &'b [u8], store: &mut Store) -> &'b [u8];
 
-    /// The transport took everything.
+    /// The transport has taken everything.
     fn sent(&mut self) {}
 
     /// The peer's transport has acknowledged all but `left` bytes.
     fn acked(&mut self, _left: u32, _store: &mut Store) {}
 
-    /// Looks at the clock, the supervisor apart.
+    /// Handles what is due, except in the supervisor.
     fn advance(&mut self, _store: &mut Store) {}
 
-    /// When it has something to do by itself, the supervisor apart.
+    /// When something is due without an input, except in the supervisor.
     fn deadline(&self) -> Instant {
         Instant::NEVER
     }

@@ -1,7 +1,7 @@
-//! The connection of a port of Modbus TCP to its devices: when it is opened, and when it is given up.
+//! The connection of a Modbus TCP port to its devices: when to open it, and when to give it up.
 //!
-//! In: what the driver reports of the link. Out: its port is there, or gone; bytes for the port. What travels on it is the
-//! port's business.
+//! In: what the driver reports about the link. Out: whether its port is up; bytes for the port. Does not know what
+//! travels on it.
 
 use heapless::String;
 
@@ -11,19 +11,18 @@ use crate::engine::io::{LinkId, LinkKind, PortId, Transport};
 use crate::link::{LinkTimings, Supervisor};
 use crate::time::{Duration, Instant};
 
-/// The minimum time in which a request must be acknowledged that is no event: peers acknowledge up to 200 ms late.
+/// The minimum time in which a request that is no event must be acknowledged: peers acknowledge up to 200 ms late.
 pub(crate) const PATIENCE: Duration = Duration::from_millis(250);
 
 #[derive(Debug, Clone)]
 pub(crate) struct DeviceLink {
     pub port: PortId,
-    /// The name of the port.
     pub name: Name,
     pub host: String<MAX_ADDRESS>,
     tcp_port: u16,
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
-    /// When what was handed over must have arrived; [`Instant::NEVER`] if nothing is on its way.
+    /// When everything handed over must have arrived; [`Instant::NEVER`] if nothing is in flight.
     pub due_at: Instant,
 }
 
@@ -52,19 +51,19 @@ impl DeviceLink {
         Transport::Tcp { port: self.tcp_port }
     }
 
-    /// Closes the connection, to open it again after a wait.
+    /// Closes the connection and reopens it after a wait.
     pub(crate) fn give_up(&mut self, now: Instant) {
         self.supervisor.give_up(now);
         self.due_at = Instant::NEVER;
     }
 
-    /// A request was handed over, to arrive by `until`.
+    /// A request was handed over; it must arrive by `until`.
     pub(crate) fn handed_over(&mut self, until: Instant) {
         bump(&mut self.counters.sent);
         self.due_at = self.due_at.min(until);
     }
 
-    /// Handles the clock. What is not acknowledged in time must not arrive later.
+    /// Handles what is due. What is not acknowledged in time must not arrive later.
     pub(crate) fn advance(&mut self, now: Instant) {
         if now >= self.due_at {
             bump(&mut self.counters.unacknowledged);
@@ -75,7 +74,7 @@ impl DeviceLink {
         }
     }
 
-    /// When it has something to do without an input.
+    /// When something is due without an input.
     pub(crate) fn deadline(&self) -> Instant {
         self.supervisor.deadline().min(self.due_at)
     }

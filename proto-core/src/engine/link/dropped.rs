@@ -1,8 +1,8 @@
-//! Why a field's value gave the controller no command, as counters and status report it.
+//! Why a field's value gave no command, for counters and status.
 
 use crate::time::Instant;
 
-/// Why a value gave the controller no command.
+/// Why a value gave no command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
@@ -14,7 +14,7 @@ pub enum DropReason {
     Based,
     /// The link to port 2000 was down, or was lost while the command waited.
     NoLink,
-    /// As many commands waited as there is room for.
+    /// The queue of waiting commands was full.
     QueueFull,
     /// It could not be sent within 1 s.
     TooOld,
@@ -61,7 +61,7 @@ impl DropReason {
 /// The newest value of a port that gave no command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DroppedCommand {
-    /// When this was known.
+    /// When the reason was known.
     pub at: Instant,
     /// The reason.
     pub why: DropReason,

@@ -1,5 +1,5 @@
-//! Commands that the controller replied to with a failure, and the controller's states at that moment:
-//! a reply of port 2000 says only that it failed.
+//! Commands that the controller answered with a failure, and the controller's states at that moment: a reply on port
+//! 2000 does not say why.
 
 use super::state::ControllerStatus;
 use super::stops::Waiting;
@@ -8,11 +8,11 @@ use crate::engine::io::{PortId, ReplyCode};
 use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 
-/// The newest command of each port that failed.
+/// The newest failed command of each port.
 #[derive(Debug, Clone)]
 pub(crate) struct FailedCommands {
     newest: [Option<Failed>; MAX_PORTS],
-    /// Of one of them the controller's states are still to be noted.
+    /// The controller's states are still to be noted for at least one of them.
     pub is_open: bool,
 }
 
@@ -23,7 +23,7 @@ impl FailedCommands {
         *self.newest.get(usize::from(port.0))?
     }
 
-    /// The controller replied to a command.
+    /// Notes the controller's reply to a command.
     pub(crate) fn note(&mut self, command: Waiting, code: ReplyCode, now: Instant) {
         if code == ReplyCode::Fail
             && let Some(failed) = self.newest.get_mut(usize::from(command.port.0))
@@ -33,30 +33,30 @@ impl FailedCommands {
         }
     }
 
-    /// What the newest state packet says, and when it came.
+    /// Notes the states in the newest state packet, and when it arrived.
     pub(crate) fn note_states(&mut self, newest: Option<([u8; 4], Instant)>) {
         self.is_open = false;
         self.newest.iter_mut().flatten().for_each(|failed| failed.note_states(newest));
     }
 }
 
-/// A command that failed, as the command link keeps it.
+/// A failed command, as the command link keeps it.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Failed {
     pub at: Instant,
     pub value: i64,
     pub entry: u16,
-    /// Codes of mode, robot, program and safety in the newest packet then.
+    /// Codes of mode, robot, program and safety in the newest state packet at that moment.
     codes: [u8; 4],
     /// Age of that packet in microseconds.
     age_us: u32,
     seen: Seen,
 }
 
-/// What is known of the controller's states at a failure.
+/// What is known about the controller's states at a failure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Seen {
-    /// Nobody has looked yet.
+    /// They have not been noted yet.
     Unasked,
     /// There was no packet.
     Nothing,
@@ -69,7 +69,7 @@ impl Failed {
         Self { at, value, entry, codes: [0; 4], age_us: 0, seen: Seen::Unasked }
     }
 
-    /// The newest packet has these codes and came at `at`, if there is one.
+    /// Notes the codes of the newest packet and when it arrived, if there is one.
     fn note_states(&mut self, newest: Option<([u8; 4], Instant)>) {
         if self.seen != Seen::Unasked {
             return;
@@ -81,22 +81,22 @@ impl Failed {
         }
     }
 
-    /// The controller's states then; `None` if no packet had come.
+    /// The controller's states at that moment; `None` if no packet had arrived.
     pub(crate) fn states(&self, dialect: &Dialect) -> Option<ControllerStatus> {
         let age = Duration::from_micros(self.age_us.into());
         (self.seen == Seen::Packet).then(|| ControllerStatus { states: dialect.states(self.codes), age })
     }
 }
 
-/// The newest command of a port that the controller replied to with a failure.
+/// The newest command of a port that the controller answered with a failure.
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub struct FailedCommand<'a> {
-    /// When its reply came.
+    /// When the reply arrived.
     pub at: Instant,
     /// The command, such as `run(pick.jspf)`.
     pub command: CommandText<'a>,
-    /// The controller's states in the newest packet then, and the age of that packet; `None` without
-    /// a state link or before its first packet.
+    /// The controller's states in the newest packet at that moment, and the packet's age; `None` without a state link
+    /// or before its first packet.
     pub controller: Option<ControllerStatus>,
 }

@@ -1,6 +1,5 @@
-//! The bytes that were handed over to a TCP link and may not have arrived: how many the peer's
-//! transport still has to acknowledge, and until when they may be delivered (docs/engine.md section
-//! 5).
+//! The bytes handed over to a TCP link that may not have arrived: how many the peer's transport still has to
+//! acknowledge, and by when they must be delivered (docs/engine.md section 5).
 
 use heapless::Deque;
 
@@ -17,9 +16,9 @@ pub(crate) struct Flight<const N: usize> {
 
 #[derive(Debug, Clone, Copy)]
 struct Transmission {
-    /// The total after it was handed over.
+    /// `total` after it was handed over.
     end: u32,
-    /// The end of the time in which it may be delivered.
+    /// By when it must be delivered.
     until: Instant,
     /// Since when its oldest value had waited.
     born: Since,
@@ -36,16 +35,15 @@ impl<const N: usize> Flight<N> {
         self.transmissions.clear();
     }
 
-    /// `len` bytes were handed over, to be delivered before `until`, which is not earlier than that
-    /// of the previous transmission. The caller has checked [`Self::is_full`].
+    /// `len` bytes were handed over, to be delivered before `until`, which is not earlier than that of the previous
+    /// transmission. The caller has checked [`Self::is_full`].
     pub(crate) fn sent(&mut self, len: usize, until: Instant, born: Since) {
         self.total = self.total.wrapping_add(len as u32);
         let _ = self.transmissions.push_back(Transmission { end: self.total, until, born });
     }
 
-    /// This many of the bytes handed over are not acknowledged; a number larger than all of them is
-    /// ignored. `arrived` gets, for each transmission that is acknowledged, since when its oldest
-    /// value had waited.
+    /// `left` of the bytes handed over are not acknowledged; a number greater than their total is ignored. Calls
+    /// `arrived` for each acknowledged transmission with the time since which its oldest value had waited.
     pub(crate) fn acked(&mut self, left: u32, mut arrived: impl FnMut(Since)) {
         if left > i32::MAX as u32 {
             return;
@@ -59,12 +57,12 @@ impl<const N: usize> Flight<N> {
         }
     }
 
-    /// The peer has answered everything, so it has arrived, whatever its transport reports.
+    /// The peer has answered everything, so everything has arrived, whatever its transport reports.
     pub(crate) fn answered(&mut self) {
         self.transmissions.clear();
     }
 
-    /// Whether all is acknowledged.
+    /// Whether everything is acknowledged.
     pub(crate) fn is_empty(&self) -> bool {
         self.transmissions.is_empty()
     }

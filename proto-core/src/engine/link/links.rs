@@ -1,7 +1,7 @@
-//! All links: which link a report is for, and the order in which they send.
+//! All links: which link an input is for, and the order in which they send.
 //!
-//! Three kinds of links are one connection each; [`Connection`] has their differences. The command
-//! link has two connections and decides for both.
+//! State, Modbus and recipe links have one connection each; [`Connection`] has their differences. The command link has
+//! two connections and decides for both.
 
 use heapless::{String, Vec, VecView};
 
@@ -26,11 +26,11 @@ use crate::time::Instant;
 pub struct LinkInfo<'a> {
     /// The link.
     pub id: LinkId,
-    /// The name in the configuration of a listening port; for other links [`LinkKind::name`].
+    /// The configured name of a listening port's link; for other links [`LinkKind::name`].
     pub name: &'a str,
     /// Its kind.
     pub kind: LinkKind,
-    /// Where it goes, and how it is opened.
+    /// Where it goes and how it is opened.
     pub endpoint: Endpoint<'a>,
     /// Its state, and since or until when.
     pub state: LinkState,
@@ -38,9 +38,9 @@ pub struct LinkInfo<'a> {
     pub history: &'a LinkHistory,
     /// Its counters.
     pub counters: &'a LinkCounters,
-    /// Of a connection to port 2000: the newest text that no command got as its reply.
+    /// For a connection to port 2000: the newest text that was not the reply to a command.
     pub other_text: Option<OtherText<'a>>,
-    /// The instant of the snapshot, from which ages count; zero outside a [`crate::engine::Status`].
+    /// The instant of the snapshot, for ages; zero outside a [`crate::engine::Status`].
     #[cfg(feature = "serde")]
     pub(crate) at: Instant,
 }
@@ -51,7 +51,7 @@ pub(crate) type Maybe<T> = Vec<T, 1>;
 /// Maximum length of the controller's address or name.
 pub(crate) const MAX_HOST: usize = 64;
 
-/// Runs `$do` with the link `$id` as `$link`, if it is one of those with one connection.
+/// Runs `$do` with the link `$id` as `$link`, if it is a link with one connection.
 macro_rules! with_connection {
     ($links:expr, $id:expr, $link:ident => $do:expr) => {
         match $id {
@@ -85,7 +85,7 @@ pub(crate) struct Links<'e> {
     pub state: &'e mut Maybe<StateLink>,
     pub modbus: &'e mut Maybe<ModbusLink>,
     pub recipes: &'e mut VecView<Uplink>,
-    /// Together with the recipe links as many as those may be.
+    /// At most as many as recipe links.
     pub devices: &'e mut VecView<DeviceLink>,
 }
 
@@ -105,8 +105,8 @@ impl<'a> LinksView<'a> {
         (0..).map_while(move |nth| self.nth(nth))
     }
 
-    /// Since when the connection is up over which the values of a group come; [`Instant::ZERO`] if there is none, or for
-    /// what does not come from the controller.
+    /// Since when the connection that brings a group's values is up; [`Instant::ZERO`] if it is down, or if the values
+    /// do not come from the controller.
     pub(crate) fn up_since(self, group: GroupId) -> Instant {
         let state = self.state.into_iter().filter(|link| link.group == group).map(|link| &link.supervisor);
         let recipes =
@@ -133,7 +133,7 @@ impl<'a> LinksView<'a> {
         supervisor.is_some_and(Supervisor::is_up)
     }
 
-    /// When something happens without an input.
+    /// When something is due without an input.
     pub(crate) fn deadline(self) -> Instant {
         let mut first = self.deadline_of(LinkId::COMMAND);
         first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
@@ -146,7 +146,7 @@ impl<'a> LinksView<'a> {
         first
     }
 
-    /// When something happens on one link without an input.
+    /// When something is due on one link without an input.
     pub(crate) fn deadline_of(self, id: LinkId) -> Instant {
         let of = |own: Instant, supervisor: &Supervisor| own.min(supervisor.deadline());
         let deadline = match id {
@@ -161,7 +161,7 @@ impl<'a> LinksView<'a> {
         deadline.unwrap_or(Instant::NEVER)
     }
 
-    // Not a chain of iterators, which each use of it would have code of its own for.
+    // Not a chain of iterators, whose code would be duplicated at each use.
     fn nth(self, mut nth: usize) -> Option<LinkInfo<'a>> {
         if let Some(link) = self.command {
             let session = match (nth, &link.urgent) {
@@ -234,7 +234,7 @@ impl Links<'_> {
         }
     }
 
-    /// Where a link of [`LinksView::infos`] goes; the host's name is written into `buf`.
+    /// The endpoint of a link of [`LinksView::infos`]; the host name is written to `buf`.
     pub(crate) fn endpoint<'b>(&self, id: LinkId, buf: &'b mut [u8]) -> Endpoint<'b> {
         let to = self.view().infos().find(|info| info.id == id).map(|info| info.endpoint);
         let to = to.unwrap_or(Endpoint::new(Transport::Tcp { port: 0 }, ""));
@@ -245,12 +245,12 @@ impl Links<'_> {
         Endpoint::new(to.transport, core::str::from_utf8(host).unwrap_or(""))
     }
 
-    /// Handles everything that depends on the clock.
+    /// Handles everything that depends on the time.
     pub(crate) fn advance(&mut self, store: &mut Store) {
         let now = store.now;
         if let Some(link) = self.command.first_mut() {
             link.advance(now);
-            // Silence completes a reply, too.
+            // Silence can complete a reply, too.
             self.note_failed(store);
         }
         each_connection!(self, link => {
@@ -261,8 +261,7 @@ impl Links<'_> {
         });
     }
 
-    /// The gateway itself slept: the age of data on its connections is unknown, so all of them are
-    /// opened again.
+    /// The gateway itself slept: the age of data on its connections is unknown, so all of them are reopened.
     pub(crate) fn slept(&mut self, store: &mut Store) {
         let now = store.now;
         if let Some(link) = self.command.first_mut() {
@@ -306,8 +305,8 @@ impl Links<'_> {
         });
     }
 
-    /// Bytes arrived on a link. Returns whether [`Self::received`] reads them: bytes of a link that
-    /// is not up belong to a connection that the engine gave up.
+    /// Notes bytes that arrived on a link. Returns whether [`Self::received`] has to read them: bytes of a link that is
+    /// down belong to a connection that was given up.
     pub(crate) fn heard(&mut self, id: LinkId, len: usize, now: Instant) -> bool {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             return self.command.first_mut().is_some_and(|link| link.heard(id, len, now));
@@ -323,7 +322,7 @@ impl Links<'_> {
         .unwrap_or(false)
     }
 
-    /// Notes the controller's states at commands that have just failed.
+    /// Notes the controller's states for commands that have just failed.
     fn note_failed(&mut self, store: &Store) {
         if let Some(link) = self.command.first_mut()
             && link.failed.is_open
@@ -334,7 +333,7 @@ impl Links<'_> {
         }
     }
 
-    /// Reads the bytes; returns the rest if the image is to be checked first.
+    /// Reads the bytes; returns the rest if the image has to be checked first.
     pub(crate) fn received<'b>(&mut self, id: LinkId, bytes: &'b [u8], store: &mut Store) -> &'b [u8] {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.received(id, bytes, store.now));
@@ -344,7 +343,7 @@ impl Links<'_> {
         with_connection!(self, id, link => link.received(bytes, store)).unwrap_or(&[])
     }
 
-    /// The transport has taken everything. Returns when something happens there without an input.
+    /// The transport has taken everything. Returns when something is due on the link without an input.
     pub(crate) fn sent(&mut self, id: LinkId) -> Instant {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.sent(id));
@@ -366,9 +365,9 @@ impl Links<'_> {
         with_connection!(self, id, link => link.acked(left, store));
     }
 
-    /// The next output to the controller: commands that stop the robot, then field values, then
-    /// other commands. With it, the earliest of the link's deadlines that may have come earlier. Links that have nothing
-    /// to send until something else happens are no longer in `ask`.
+    /// The next output to the controller: commands that stop the robot, then field values, then other commands. Also
+    /// returns the earliest of the link's deadlines that may have become earlier. Removes links from `ask` that have
+    /// nothing to send before another event.
     pub(crate) fn next_upward(
         &mut self,
         ask: &mut Dirty,
@@ -386,7 +385,7 @@ impl Links<'_> {
             for link in self.recipes.iter_mut() {
                 left = left.wrapping_sub(1);
                 if let Some(len) = link.next_frame(store, state, out) {
-                    // It is busy now, and those before it had nothing.
+                    // This link is busy now, and those before it had nothing to send.
                     if left == 0 {
                         ask.remove(Dirty::RECIPES);
                     }
@@ -408,8 +407,8 @@ impl Links<'_> {
         link.next_command(out, store.now).map(|len| (LinkId::COMMAND, len, link.deadline()))
     }
 
-    /// What may have an output when something has happened to this link. Beside a command link, which looks at what the
-    /// others do, all.
+    /// What may have an output after an event on this link. With a command link all links may, because it depends on
+    /// what the others do.
     pub(crate) fn ask_of(&self, link: LinkId) -> Dirty {
         if !self.command.is_empty() {
             return Dirty::LINKS;
@@ -421,7 +420,7 @@ impl Links<'_> {
         }
     }
 
-    /// What may have an output after bytes came on this link, and the earliest of its deadlines that may have come
+    /// What may have an output after bytes arrived on this link, and the earliest of its deadlines that may have become
     /// earlier.
     pub(crate) fn asked_by_bytes(
         &mut self,
@@ -431,7 +430,7 @@ impl Links<'_> {
     ) -> (Dirty, Instant) {
         if self.command.is_empty() {
             match id {
-                // Its only deadline is that of silence.
+                // Its only deadline is that of silence, which moves back.
                 LinkId::STATE if self.state.first().is_some_and(|link| link.supervisor.is_up()) => {
                     return (Dirty::NONE, Instant::NEVER);
                 }
@@ -450,7 +449,7 @@ impl Links<'_> {
         (asked, self.view().deadline_of(id))
     }
 
-    /// The same, and the links that write one of these variables, which wait.
+    /// Adds the links that write one of the waiting variables.
     pub(crate) fn ask_for(&self, waiting: &InputSet, mut asked: Dirty) -> Dirty {
         if waiting.is_empty() {
             return asked;
@@ -466,7 +465,7 @@ impl Links<'_> {
         self.command.first().is_some_and(CommandLink::has_stops)
     }
 
-    /// Links to be opened and closed.
+    /// The next link to open or close.
     pub(crate) fn next_action(&mut self) -> Option<(LinkId, LinkAction)> {
         if let Some(link) = self.command.first_mut() {
             if let Some(action) = link.ordinary.supervisor.take_action() {

@@ -1,4 +1,4 @@
-//! Links to the controller, and connections to devices of Modbus TCP.
+//! Links to the controller, and Modbus TCP connections to devices.
 
 pub(crate) mod command;
 pub(crate) mod command_tables;

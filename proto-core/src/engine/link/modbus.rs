@@ -1,5 +1,5 @@
-//! The Modbus link: coalesced writes of values from the field, polls of values that ports show, one
-//! transaction in flight (docs/engine.md section 5).
+//! The Modbus link: coalesced writes of field values, polls of values that ports show, one transaction in flight
+//! (docs/engine.md section 5).
 
 use heapless::Vec;
 
@@ -21,17 +21,17 @@ use crate::sysvar::{BIT_INPUT_COUNT, ModbusPlace, SysVar};
 use crate::time::{Duration, Instant};
 use crate::wire::scalar::Scalar;
 
-/// Blocks of neighbouring coils or registers that are polled together.
+/// Maximum number of blocks of neighbouring coils or registers, each polled in one request.
 pub(crate) const MAX_POLL_BLOCKS: usize = 16;
-/// Variables polled by Modbus.
+/// Maximum number of polled variables.
 const MAX_POLLED: usize = 64;
 /// Maximum number of unneeded coils or registers that are read to join two blocks.
 const JOIN_GAP: u16 = 16;
-/// A request without an answer is given up after this.
+/// A request without a reply is given up after this.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 /// A safe value that the controller refused is written again after this.
 const REFUSED_PAUSE: Duration = Duration::from_millis(500);
-/// After this many in a row the connection is reopened.
+/// After this many timeouts in a row the connection is reopened.
 const TIMEOUTS_IN_A_ROW: u8 = 3;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,20 +68,20 @@ struct InFlight {
     until: Instant,
 }
 
-/// What is written next where bits have owners.
+/// The next write if some bits have owners.
 enum Turn {
     Whole(SysVar),
-    /// Neighbouring bits of a variable, as a mask.
+    /// Consecutive bits of a variable, as a mask.
     Bits(SysVar, u8),
 }
 
-/// The same, with its request.
+/// The result of [`ModbusLink::beside_bits`]: bits were sent, or whole variables are next.
 enum Beside {
     Bits(Option<usize>),
     Whole(InputSet),
 }
 
-/// What goes first when both a write and a poll are due.
+/// Which goes first if both a write and a poll are due.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum First {
     Write,
@@ -94,12 +94,12 @@ pub(crate) struct ModbusLink {
     pub counters: LinkCounters,
     port: u16,
     client: Client,
-    /// Variables that are written here.
+    /// Variables written through this link.
     pub writes: InputSet,
     polled: Vec<SysVar, MAX_POLLED>,
     blocks: Vec<Block, MAX_POLL_BLOCKS>,
     in_flight: Option<InFlight>,
-    /// Bits with owners that are written in it and have their safe value.
+    /// The bits with owners in the transaction in flight that have their safe value.
     safe_bits: Option<(SysVar, u8)>,
     /// Since when a value from a field frame has waited to be handed over.
     pub offered: Since,
@@ -108,9 +108,9 @@ pub(crate) struct ModbusLink {
     flight: Flight<2>,
     timeouts_in_a_row: u8,
     first: First,
-    /// The next write starts at this variable, so that none waits for ever.
+    /// The next write starts at this variable, so that none waits forever.
     cursor: usize,
-    /// The same for the bits of that variable.
+    /// Like `cursor`, for the bits of that variable.
     bit_cursor: u8,
     /// Safe values that the controller refused; they are written again at `ask_again_at`.
     refused: InputSet,
@@ -119,7 +119,7 @@ pub(crate) struct ModbusLink {
 }
 
 impl ModbusLink {
-    /// Whether it reads the variables of a group.
+    /// Whether it polls the variables of a group.
     pub(crate) fn polls(&self, group: GroupId) -> bool {
         self.blocks.iter().any(|block| block.group == group)
     }
@@ -152,8 +152,8 @@ impl ModbusLink {
         Transport::Tcp { port: self.port }
     }
 
-    /// Polls a variable every `period`; false if there are too many. Variables must be added in the
-    /// order of their Modbus places, so that blocks join.
+    /// Polls a variable every `period`; `None` if there are too many. Variables must be added in the order of their
+    /// Modbus addresses, so that blocks join.
     pub(crate) fn poll_var(
         &mut self,
         var: SysVar,
@@ -203,7 +203,7 @@ impl ModbusLink {
         }
     }
 
-    /// A request of so many bytes is handed over. Returns their number.
+    /// Notes a request of `len` bytes that is handed over, and returns `len`.
     fn asked(&mut self, len: usize, asked: Asked, next: First, now: Instant) -> Option<usize> {
         self.first = next;
         bump(&mut self.counters.sent);
@@ -214,15 +214,15 @@ impl ModbusLink {
         Some(len)
     }
 
-    /// The transport took a request that is still to be answered: nothing else can be asked before. `None` if something
-    /// can be; then it was not noted. Otherwise [`Instant::NEVER`], as no deadline has changed.
+    /// The transport has taken a request that is still unanswered, so nothing else can be sent: returns
+    /// [`Instant::NEVER`], because no deadline has changed. `None` if something may be sent; nothing has changed then.
     pub(crate) fn sent_before_answer(&mut self) -> Option<Instant> {
         self.in_flight.as_ref()?;
         self.unsent = false;
         Some(Instant::NEVER)
     }
 
-    /// Whether [`Self::next_request`] may have one, on a link that is up.
+    /// Whether [`Self::next_request`] may return one; the link is up.
     pub(crate) fn may_ask(&mut self, waiting: &InputSet, now: Instant) -> bool {
         if self.in_flight.is_some() || self.unsent {
             return false;
@@ -234,13 +234,12 @@ impl ModbusLink {
         self.blocks.iter().any(|block| block.grid.next() <= now)
     }
 
-    /// When the transaction in flight is given up; [`Instant::NEVER`] if none is.
+    /// When the transaction in flight is given up; [`Instant::NEVER`] if there is none.
     pub(crate) fn answer_deadline(&self) -> Instant {
         self.in_flight.map_or(Instant::NEVER, |asked| asked.until)
     }
 
-    /// Gives up the transaction in flight. It is not known whether a write was carried out; only
-    /// safe values are written again.
+    /// Gives up the transaction in flight. Whether a write was executed is unknown; only safe values are written again.
     fn abort(&mut self, store: &mut Store) {
         self.client.abort();
         if let Some(InFlight { asked: Asked::Write { safe, .. }, .. }) = self.in_flight.take() {
@@ -258,7 +257,7 @@ impl ModbusLink {
         }
     }
 
-    /// What came is no Modbus: the connection is closed.
+    /// Invalid Modbus arrived: closes the connection.
     fn violated(&mut self, store: &mut Store) {
         bump(&mut self.counters.malformed);
         self.supervisor.give_up(store.now);
@@ -288,7 +287,7 @@ impl ModbusLink {
         self.ask_again_at = Instant::NEVER;
     }
 
-    /// The block whose poll has waited longest.
+    /// The block whose poll has been due longest.
     fn due_block(&self, now: Instant) -> Option<usize> {
         let due = self.blocks.iter().enumerate().filter(|(_, block)| block.grid.next() <= now);
         due.min_by_key(|(_, block)| block.grid.next()).map(|(nth, _)| nth)
@@ -296,7 +295,7 @@ impl ModbusLink {
 
     fn poll(&mut self, nth: usize, out: &mut [u8], now: Instant) -> Option<usize> {
         let block = self.blocks.get_mut(nth)?;
-        // Polls missed while a transaction was in flight are not made up for.
+        // Polls missed while a transaction was in flight are skipped.
         block.grid.due(now);
         let (address, count) = (block.first, block.count);
         let request = match block.kind {
@@ -309,7 +308,7 @@ impl ModbusLink {
 
     /// One request for the first pending variable and those that follow it without a gap.
     fn write(&mut self, store: &mut Store, out: &mut [u8]) -> Option<usize> {
-        // Once more: a set that is handed over does not stay in registers.
+        // Computed again, because a set passed as an argument does not stay in registers.
         let mut pending = store.outbox.dirty().and(&self.writes);
         if store.bits.is_used {
             match self.beside_bits(store, out) {
@@ -325,7 +324,7 @@ impl ModbusLink {
         sent
     }
 
-    /// Where bits have owners: a request for some of them, or the whole variables whose turn it is.
+    /// If bits have owners: sends some of them, or returns the whole variables whose turn it is.
     fn beside_bits(&mut self, store: &mut Store, out: &mut [u8]) -> Beside {
         let pending = store.outbox.dirty().and(&self.writes);
         match self.bits_turn(&pending, store) {
@@ -339,7 +338,7 @@ impl ModbusLink {
         }
     }
 
-    /// What waits beside a request counts as offered with it.
+    /// Values that were not part of the request count as offered with it.
     fn offer_the_rest(&mut self, store: &Store) {
         if !store.outbox.dirty().and(&self.writes).is_empty()
             && let Some(InFlight { asked: Asked::Write { born, .. }, .. }) = self.in_flight
@@ -365,12 +364,12 @@ impl ModbusLink {
             ModbusPlace::Register { address } => (address, Kind::Registers, 1, MAX_WRITE_REGISTERS),
             ModbusPlace::Scaled { .. } => return None,
         };
-        // Variables of one row of the table follow each other in the map as they do in the image.
+        // Variables of one row of the table have consecutive Modbus addresses, as in the image.
         let most = usize::from(most).min(place.left_in_row);
         let count = pending.run_len(first).min(most);
         let vars = InputSet::run(first, count);
         self.cursor = first.ordinal().saturating_add(count);
-        // Registers are packed after the longest request, where nothing has to be cleared for them.
+        // Registers are packed after the longest request, where no buffer has to be cleared for them.
         let (out, room) = out.split_at_mut_checked(MAX_ADU)?;
         let mut bits;
         let request = match kind {
@@ -406,8 +405,8 @@ impl ModbusLink {
         self.asked(len, Asked::Write { safe, born }, First::Poll, store.now)
     }
 
-    /// Whose turn it is where bits have owners: the first variable at or behind the cursor, or the
-    /// first run of waiting bits there.
+    /// The next write if bits have owners: the first variable from the cursor on, or the first run of waiting bits
+    /// there.
     fn bits_turn(&self, pending: &InputSet, store: &Store) -> Option<Turn> {
         let turn = |var: SysVar, from: u8| {
             if !store.bits.bytes.contains(var) {
@@ -524,7 +523,7 @@ impl Connection for ModbusLink {
         bump(&mut self.counters.timeouts);
         self.abort(store);
         self.timeouts_in_a_row = self.timeouts_in_a_row.saturating_add(1);
-        // A request that has not arrived by now would be carried out after it was given up.
+        // A request that has not arrived by now would be executed after it was given up.
         let is_under_way = self.unsent || !self.flight.is_empty();
         if is_under_way {
             bump(&mut self.counters.unacknowledged);
@@ -550,7 +549,7 @@ impl Connection for ModbusLink {
     }
 }
 
-/// The longest request and its registers.
+/// The longest request and its registers fit.
 const _: () = assert!(MAX_ADU + 2 * MAX_WRITE_REGISTERS as usize <= OUTPUT_BUFFER);
 
 fn place_of(var: SysVar) -> Option<(u16, Kind)> {
@@ -561,13 +560,13 @@ fn place_of(var: SysVar) -> Option<(u16, Kind)> {
     }
 }
 
-/// Writes the answer to a poll into the image.
+/// Writes the reply to a poll into the image.
 pub(crate) fn take_poll(block: &Block, polled: &[SysVar], response: Response<'_>, store: &mut Store) {
     if store.bits.is_used {
         take_values_beside_bits(block, polled, response, store);
     } else {
         take_values(block, polled, response, |var, value| {
-            // The table gives the variable's type, and bits beyond it were not read.
+            // Cannot fail: the table has the variable's type, and bits beyond it were not read.
             let _ = store.image.set(var, value);
         });
     }
@@ -575,7 +574,7 @@ pub(crate) fn take_poll(block: &Block, polled: &[SysVar], response: Response<'_>
     store.unconfirm_by_witnesses();
 }
 
-/// The same where bits have owners.
+/// [`take_values`] if bits have owners.
 fn take_values_beside_bits(block: &Block, polled: &[SysVar], response: Response<'_>, store: &mut Store) {
     take_values(block, polled, response, |var, value| match value {
         Scalar::Byte(shown) if store.bits.bytes.contains(var) => store.show_bits(var, shown),

@@ -1,5 +1,5 @@
-//! Texts of port 2000 that no command got as its reply: the newest of each connection, for status and
-//! statistics (docs/engine.md section 7).
+//! Texts on port 2000 that were not the reply to a command: the newest of each connection, for status and statistics
+//! (docs/engine.md section 7).
 
 use heapless::String;
 
@@ -7,29 +7,29 @@ use super::stops::Waiting;
 use crate::config::CommandText;
 use crate::time::Instant;
 
-/// Maximum length of a text that is kept, in bytes; the rest is cut off.
+/// Maximum length of a kept text in bytes; the rest is cut off.
 pub const MAX_OTHER_TEXT: usize = 48;
 
-/// A text that no command got as its reply, and the command whose reply it may be.
+/// A text that was not the reply to a command, and the command that it may answer.
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub struct OtherText<'a> {
-    /// When it was complete.
+    /// When the text was complete.
     pub at: Instant,
-    /// The text, at most [`MAX_OTHER_TEXT`] bytes of it. Control characters are blanks, and bytes that are
-    /// not UTF-8 are U+FFFD.
+    /// At most the first [`MAX_OTHER_TEXT`] bytes of the text. Control characters are replaced by blanks, bytes that
+    /// are not UTF-8 by U+FFFD.
     pub text: &'a str,
-    /// The unanswered command whose reply it may be, such as `disable`; `None` for the late reply to an
-    /// earlier one, and when nothing was unanswered.
+    /// The unanswered command that it may answer, such as `disable`; `None` for a late reply to an earlier command, and
+    /// if no command was unanswered.
     pub command: Option<CommandText<'a>>,
 }
 
-/// The same, as a connection keeps it.
+/// An [`OtherText`] as a connection keeps it.
 #[derive(Debug, Clone)]
 pub(crate) struct LastText {
     pub at: Instant,
     pub text: String<MAX_OTHER_TEXT>,
-    /// The entry of the command, and its value.
+    /// The entry and value of the command.
     pub entry: Option<u16>,
     pub value: i64,
 }

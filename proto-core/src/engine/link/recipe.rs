@@ -1,7 +1,7 @@
-//! A recipe link: the controller's own recipe port, the fast way up and down.
+//! A recipe link: the controller's own recipe port, the fast route in both directions.
 //!
-//! Whole frames go up, so every variable in them needs a value that its owner sent or that was read
-//! back (docs/engine.md section 5). Frames that come down go into the image.
+//! Frames to the controller are whole, so every variable in them needs a value that its owner sent or that was read
+//! back (docs/engine.md section 5). Received frames go into the image.
 
 use super::connection::Connection;
 use super::flight::Flight;
@@ -21,17 +21,16 @@ use crate::recipe::{Deframer, datagram};
 use crate::sysvar::BIT_INPUT_COUNT;
 use crate::time::{Duration, Instant};
 
-/// Maximum age of a value that was read back, to go into a frame.
+/// Maximum age of a value that was read back, for use in a frame.
 const READ_BACK_MAX_AGE: Duration = Duration::from_millis(500);
-/// Interval at which a safe value is sent again, until the controller shows it.
+/// Interval at which a safe value is repeated until the controller shows it.
 const REPEAT_EVERY: Duration = Duration::from_millis(4);
-/// The same if nothing can show it, after [`REPEAT_FAST`].
+/// The interval if nothing can show it, after [`REPEAT_FAST`].
 const REPEAT_SLOWLY: Duration = Duration::from_millis(100);
 const REPEAT_FAST: Duration = Duration::from_secs(1);
-/// Maximum number of unacknowledged frames: those of 250 ms, one every 4 ms.
+/// Maximum number of unacknowledged frames: 250 ms of one frame every 4 ms.
 const MOST_UNACKNOWLEDGED: usize = 64;
-/// Interval of greetings without frames: the UDP server streams to everybody who has sent it
-/// something (D24).
+/// Interval of greetings without frames: the UDP server streams to everyone who has sent it something (D24).
 const GREET_EVERY: Duration = Duration::from_millis(500);
 /// The server may forget a client that was silent for 60 s (D30).
 const SPEAK_EVERY: Duration = Duration::from_secs(20);
@@ -40,7 +39,7 @@ const SPEAK_EVERY: Duration = Duration::from_secs(20);
 pub(crate) struct Uplink {
     pub id: LinkId,
     pub kind: LinkKind,
-    /// The name in the configuration of a listening port.
+    /// The configured name of a listening port.
     pub name: Option<Name>,
     pub transport: Transport,
     pub supervisor: Supervisor,
@@ -49,13 +48,13 @@ pub(crate) struct Uplink {
     input: Option<StreamLayout>,
     output: Option<StreamLayout>,
     deframer: Deframer,
-    /// Variables in the frames up.
+    /// Variables in the frames to the controller.
     set: InputSet,
-    /// Those of them that are written here: a frame is sent when one has a new value.
+    /// Variables of `set` that this link writes: a frame is sent when one has a new value.
     pub writes: InputSet,
-    /// The contents of the frames down.
+    /// The group of the variables in received frames.
     pub group: Option<GroupId>,
-    /// Of the variables written here, those for which something shows the controller's value.
+    /// Variables of `writes` whose value in the controller is shown by something.
     pub shown: InputSet,
     /// Since when a value from a field frame has waited to be handed over.
     pub offered: Since,
@@ -64,12 +63,11 @@ pub(crate) struct Uplink {
     busy: bool,
     flight: Flight<MOST_UNACKNOWLEDGED>,
     greet_at: Instant,
-    /// When the controller may forget the gateway (D30).
+    /// When to send so that the controller does not forget the gateway (D30).
     speak_at: Instant,
     /// When safe values are sent again.
     repeat_at: Instant,
-    /// When the newest frame since the link came up was handed over, and in which era of the
-    /// controller.
+    /// When the newest frame since the link came up was handed over, and in which era of the controller.
     handed_over: Option<(Instant, u32)>,
 }
 
@@ -82,7 +80,7 @@ pub(crate) struct UplinkSetup {
     pub timings: &'static LinkTimings,
     pub input: Option<StreamLayout>,
     pub output: Option<StreamLayout>,
-    /// Variables in the frames up, and those of them that are written here.
+    /// Variables in the frames to the controller; `writes`: those that this link writes.
     pub set: InputSet,
     pub writes: InputSet,
     pub group: Option<GroupId>,
@@ -143,7 +141,7 @@ impl Uplink {
         self.send(wanted, store, state, out)
     }
 
-    /// The same, if there is something to send. Mostly there is not: so the check stays short.
+    /// The rest of [`Self::next_frame`], separate to keep the frequent check short.
     fn send(
         &mut self,
         wanted: bool,
@@ -185,8 +183,8 @@ impl Uplink {
         Some(len)
     }
 
-    /// The transport took what was sent, and nothing else is to be sent before `until`. Returns when that is; `None` if
-    /// there may be something, and then it was not noted.
+    /// The transport has taken everything, and nothing else is to be sent before `until`: returns when something is.
+    /// `None` if something may have to be sent earlier; nothing has changed then.
     pub(crate) fn sent_before_next(&mut self, outbox: &Outbox, until: Instant) -> Option<Instant> {
         let speaks_at = self.speaks_at();
         if !self.supervisor.is_up()
@@ -211,25 +209,23 @@ impl Uplink {
         self.greet_at.min(self.speak_at)
     }
 
-    /// Whether every variable of the frame has a value that its owner sent or that was just read
-    /// back.
+    /// Whether every variable of the frame has a value that its owner sent or that was just read back.
     pub(crate) fn is_ready(&self, store: &Store, state: impl FnOnce() -> Option<GroupId>) -> bool {
         let others = self.set.minus(&store.live);
         others.is_empty() || self.are_known(&others, store, state())
     }
 
-    /// The same of those that have no value of their owner.
+    /// Like [`Self::is_ready`], for variables without a value of their owner.
     fn are_known(&self, others: &InputSet, store: &Store, state: Option<GroupId>) -> bool {
         let read_back = state
             .and_then(|group| store.image.stamp_of(group))
             .is_some_and(|at| store.now.saturating_since(at) <= READ_BACK_MAX_AGE);
-        // Without a connection, only frames that come down show that the controller has been there
-        // all along.
+        // Without a connection, only received frames show that the controller has been there all along.
         let is_there = |era| self.framing == Framing::Bytes || era == store.era && store.is_heard();
         let since = self.handed_over.filter(|&(_, era)| is_there(era)).map(|(at, _)| at);
         others.iter().all(|var| match var.stream() {
             Some(_) => read_back && store.read_back.contains(var),
-            // The newest frame had the variable's last value, and the controller has had it ever since.
+            // The newest frame had the variable's last value, and the controller has kept it since.
             None => {
                 store.image.known_since(var).is_some_and(|at| since >= Some(at))
                     && !store.unsent.contains(var)
@@ -237,12 +233,12 @@ impl Uplink {
         })
     }
 
-    /// Whether the controller must be asked for its frames.
+    /// Whether the controller only sends frames after a greeting.
     fn greets(&self) -> bool {
         self.kind == LinkKind::RecipeUdp && self.output.is_some()
     }
 
-    /// A datagram that cannot be a frame.
+    /// Writes a datagram that cannot be a frame.
     fn greeting(&self, out: &mut [u8]) -> Option<usize> {
         let is_frame = |len| self.input.as_ref().is_some_and(|layout| layout.frame_len() == len);
         let len = if is_frame(1) { 2 } else { 1 };
@@ -356,13 +352,13 @@ impl Connection for Uplink {
     }
 }
 
-/// Whether a safe value has just become one that the controller is not known to have.
+/// Whether a safe value became unconfirmed only recently.
 fn is_new(store: &Store) -> bool {
     store.now.saturating_since(store.unconfirmed_since) < REPEAT_FAST
 }
 
-/// Writes a frame into the image. A value that is not finite makes its variable unknown; the others
-/// are used. Returns the number of such values.
+/// Writes a frame into the image. A value that is not finite makes its variable unknown; the others are used. Returns
+/// the number of such values.
 fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize {
     let system = |field: PlacedField| match field.field {
         Field::System(var) => Some(var),
@@ -377,7 +373,7 @@ fn take_frame(layout: &StreamLayout, payload: &[u8], image: &mut Image) -> usize
     values.fold(0, |sum: usize, (var, value)| sum.saturating_add(usize::from(!image.receive(var, value))))
 }
 
-/// The frame, with byte variables as they are written next, not as they were received last.
+/// Encodes a frame with byte variables as they are to be written next, not as they were last received.
 fn encode(layout: &StreamLayout, store: &mut Store, out: &mut [u8]) -> Option<usize> {
     let waiting = store.outbox.dirty().and(&InputSet::BYTES);
     if waiting.is_empty() {

@@ -1,5 +1,5 @@
-//! One connection to port 2000: the commands in flight on it, and their results (docs/engine.md
-//! section 7). The command link decides which command goes where.
+//! One connection to port 2000: the commands in flight on it, and their results (docs/engine.md section 7). Does not
+//! decide which command goes where; the command link does.
 
 use super::flight::Flight;
 use super::other_text::LastText;
@@ -17,9 +17,8 @@ use crate::wire::dialect::Dialect;
 pub(crate) struct Sent {
     pub command: Waiting,
     pub keyword: Keyword,
-    /// When it was handed over.
     pub at: Instant,
-    /// It has arrived, and the controller has sent a text that may be its reply in unknown words.
+    /// It has arrived, and the controller has sent an unknown text that may be its reply.
     pub has_text: bool,
 }
 
@@ -27,7 +26,7 @@ pub(crate) struct Sent {
 pub(crate) enum Event {
     /// A command has its result.
     Answered(Sent, ReplyCode),
-    /// Another event, which is counted.
+    /// Another event; it is counted.
     Other,
     /// The connection must be given up.
     TimedOut,
@@ -38,10 +37,10 @@ pub(crate) struct Session {
     pub supervisor: Supervisor,
     pub counters: LinkCounters,
     client: CommandClient,
-    /// The command whose reply is pending, and a newer, urgent one that did not wait for it.
+    /// The command whose reply is pending; `beside`: a newer, urgent one that did not wait for it.
     pub in_flight: Option<Sent>,
     pub beside: Option<Sent>,
-    /// The newest text that no command got as its reply.
+    /// The newest text that was not the reply to a command.
     pub last_text: Option<LastText>,
     /// The transport has not taken the newest command yet.
     unsent: bool,
@@ -62,7 +61,7 @@ impl Session {
         }
     }
 
-    /// Whether a command can be sent that must wait for the previous reply.
+    /// Whether a command that has to wait for the previous reply can be sent.
     pub(crate) fn is_free(&self) -> bool {
         self.supervisor.is_up() && !self.unsent && !self.client.busy()
     }
@@ -72,12 +71,12 @@ impl Session {
         self.supervisor.is_up() && !self.unsent && !self.client.busy_beside() && !self.flight.is_full()
     }
 
-    /// Whether something that was handed over may still be on its way.
+    /// Whether something that was handed over may not have arrived.
     pub(crate) fn is_unacknowledged(&self) -> bool {
         !self.flight.is_empty()
     }
 
-    /// Writes the command into `out`, to be acknowledged by `until`.
+    /// Writes the command to `out`; it must be acknowledged by `until`.
     pub(crate) fn send(
         &mut self,
         (keyword, command): (Keyword, Waiting),
@@ -112,13 +111,14 @@ impl Session {
         self.flight.acked(left, |_| ());
     }
 
-    /// Bytes arrived.
+    /// Notes bytes that arrived.
     pub(crate) fn heard(&mut self, len: usize, now: Instant) {
         self.supervisor.heard(now);
         add(&mut self.counters.bytes_in, len);
     }
 
-    /// Events count as in time, however late they are handled: only a tick lets a deadline pass.
+    /// The instant at which events count: before the deadline, however late they are handled, because only a tick lets
+    /// it pass.
     pub(crate) fn in_time(&self, now: Instant) -> Instant {
         let before = |at: Instant| at - Duration::from_micros(1);
         self.client.deadline().map_or(now, |deadline| now.min(before(deadline)))
@@ -132,7 +132,7 @@ impl Session {
         [self.in_flight.take(), self.beside.take()]
     }
 
-    /// Whether the connection must be given up because something was not acknowledged.
+    /// Whether the connection must be given up because something was not acknowledged in time.
     pub(crate) fn is_overdue(&mut self, now: Instant) -> bool {
         let overdue = now >= self.flight.deadline();
         if overdue {
@@ -164,7 +164,7 @@ impl Session {
                 };
                 self.last_text = Some(LastText::new(now, text, sent.as_ref().map(|sent| sent.command)));
                 if let Some(sent) = sent {
-                    // What came before the command had arrived is not its reply.
+                    // A text that came before the command had arrived is not its reply.
                     sent.has_text |= self.flight.is_empty();
                 }
                 return Some(Event::Other);
@@ -191,7 +191,7 @@ impl Session {
         Some(Event::Answered(sent, code))
     }
 
-    /// When something happens without an input, apart from the supervisor.
+    /// When something is due without an input, except in the supervisor.
     pub(crate) fn deadline(&self) -> Instant {
         self.client.deadline().unwrap_or(Instant::NEVER).min(self.flight.deadline())
     }

@@ -21,15 +21,15 @@ use crate::wire::state::{StateStream, StateView};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct ControllerStatus {
-    /// Mode, and robot, program and safety state.
+    /// Mode, and the states of robot, program and safety.
     pub states: States,
-    /// Time since that packet.
+    /// Age of that packet.
     pub age: Duration,
 }
 
 /// A stream that is silent for this long is reopened: twenty packets are missing.
 const SILENCE: Duration = Duration::from_secs(2);
-/// Misaligned packets in a row that end the connection (D8).
+/// This many misaligned packets in a row end the connection (D8).
 const MISALIGNED_IN_A_ROW: u32 = 3;
 
 #[derive(Debug, Clone)]
@@ -40,11 +40,11 @@ pub(crate) struct StateLink {
     pub dialect: Dialect,
     pub group: GroupId,
     stream: StateStream,
-    /// Variables that come from here.
+    /// Variables taken from the stream.
     pub shown: Vec<SysVar, COUNT>,
     /// Input variables whose present value is read back while no port sends them.
     pub read_back: InputSet,
-    /// The same for variables of whose bits each has its owner.
+    /// Like `read_back`, for variables whose bits have owners.
     read_back_bits: InputSet,
     /// Codes of mode, robot, program and safety in the newest packet.
     pub codes: [u8; 4],
@@ -64,7 +64,7 @@ pub(crate) struct Kept {
 }
 
 impl Kept {
-    /// The value in a packet; not a number if it cannot be read.
+    /// The value in a packet; NaN if it cannot be read.
     fn read(&self, view: &StateView<'_>) -> f64 {
         let bytes = view.as_bytes().get(usize::from(self.offset)..).unwrap_or(&[]);
         let bytes = bytes.get(..self.ty.size()).unwrap_or(&[]);
@@ -89,7 +89,7 @@ impl StateLink {
         }
     }
 
-    /// These variables have bits with owners.
+    /// The bits of these variables have owners.
     pub(crate) fn share(&mut self, bytes: &InputSet) {
         self.read_back_bits = self.read_back.and(bytes);
         self.read_back = self.read_back.minus(bytes);
@@ -99,8 +99,8 @@ impl StateLink {
         Transport::Tcp { port: self.port }
     }
 
-    /// Takes bytes that do not complete a packet: what is heard only makes deadlines later. `false` if
-    /// [`Connection::received`] has to read them, or nothing of this connection counts; then nothing was taken.
+    /// Takes bytes that do not complete a packet; they only make deadlines later. False if [`Connection::received`] has
+    /// to read them, or if the link is down; nothing was taken then.
     pub(crate) fn hold(&mut self, bytes: &[u8], now: Instant) -> bool {
         if !self.supervisor.is_up() || !self.stream.hold(bytes) {
             return false;
@@ -115,7 +115,6 @@ impl Connection for StateLink {
     fn opened(&mut self, _store: &mut Store) {}
 
     fn lost(&mut self, _store: &mut Store) {
-        // Half a packet is of no use.
         self.stream.reset();
     }
 
@@ -141,7 +140,7 @@ impl Connection for StateLink {
                         if view.read_var(var).is_some_and(|value| store.image.set(var, value).is_ok()) {
                             store.read_back.insert(var);
                         } else {
-                            // It is unknown, so it must not be written back.
+                            // Its value is unknown, so it must not be written back.
                             store.read_back.remove(var);
                             if store.image.is_readable(var) {
                                 bump(&mut self.counters.unreadable);
@@ -172,7 +171,7 @@ impl Connection for StateLink {
     }
 }
 
-/// The first variables that follow each other in the table, and so in the packet and in the image; at most what is
+/// The first variables that are consecutive in the table, and so in the packet and in the image; at most as many as are
 /// copied at once.
 fn next_run(shown: &[SysVar]) -> Option<(&[SysVar], &[SysVar])> {
     let first = shown.first()?;
@@ -182,8 +181,8 @@ fn next_run(shown: &[SysVar]) -> Option<(&[SysVar], &[SysVar])> {
     shown.split_at_checked(len.max(1))
 }
 
-/// Copies a run of words or floats. `None`, with nothing changed, if its variables have to be looked at one by one:
-/// bits, a value that is not finite, or one before it that was not.
+/// Copies a run of words or floats. `None`, with nothing changed, if its variables have to be checked one by one: bits,
+/// values that are not finite, or variables that had such a value.
 fn take_run(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> Option<()> {
     let first = run.first()?;
     if first.is_bits() || image.has_unreadable() {
@@ -198,14 +197,14 @@ fn take_run(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> Option<(
     Some(())
 }
 
-/// Takes a run's variables one by one; returns how many cannot be read.
+/// Takes a run's variables one by one; returns how many are unreadable.
 fn take_each(run: &[SysVar], view: &StateView<'_>, image: &mut Image) -> usize {
     let is_unreadable =
         |var: &&SysVar| !view.read_var(**var).is_some_and(|value| image.receive(**var, value));
     run.iter().filter(is_unreadable).count()
 }
 
-/// Reads back the bits that none of our ports has sent.
+/// Reads back the bits that no port has sent.
 fn read_bits(view: &StateView<'_>, bytes: &InputSet, store: &mut Store) {
     for var in bytes.iter() {
         if let Some(Scalar::Byte(shown)) = view.read_var(var) {
@@ -215,14 +214,14 @@ fn read_bits(view: &StateView<'_>, bytes: &InputSet, store: &mut Store) {
     }
 }
 
-/// Keeps the packet's other values that ports show; returns how many are unreadable.
+/// Keeps other values of the packet that ports show; returns how many are unreadable.
 fn keep(kept: &[Kept], view: &StateView<'_>, image: &mut Image) -> usize {
     let unreadable = kept.iter().filter(|kept| !image.receive_extra(kept.extra, kept.read(view)));
     unreadable.count()
 }
 
-/// Confirms safe values that the controller shows. A value shown by an old packet, or overwritten
-/// by late data, loses its confirmation.
+/// Confirms safe values that the controller shows. A value that an old packet confirmed, or that late data has
+/// overwritten, becomes unconfirmed again.
 fn compare_safe(view: &StateView<'_>, store: &mut Store) {
     let (may_confirm, may_unconfirm) = (store.may_confirm(), store.may_unconfirm());
     for var in store.safe.iter() {
