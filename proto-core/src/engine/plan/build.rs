@@ -39,7 +39,7 @@ use crate::time::{Duration, Instant};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
 
-/// Groups are assigned in order: field frames first.
+/// Assigns groups in order, field frames first.
 pub(crate) struct Groups(u8);
 
 impl Groups {
@@ -51,7 +51,8 @@ impl Groups {
 }
 
 impl EngineView<'_> {
-    // Out of line, as the parts that make large values: a run loop would hold their stacks for ever, and these would add up.
+    // Out of line, like the other parts that make large values: inlined into a run loop, their stack frames would be
+    // held forever and add up.
     #[inline(never)]
     pub(crate) fn build(&mut self, config: ConfigView<'_>) -> Result<(), BuildError> {
         config.validate().map_err(BuildError::Config)?;
@@ -62,10 +63,10 @@ impl EngineView<'_> {
         };
         let dialect = Dialect::named(&config.controller.dialect).ok_or(BuildError::UnknownDialect)?;
         self.check_room(config)?;
-        // As long as the configuration's, which is as long as the engine's.
+        // Cannot fail: the configuration has the same maximum length.
         let _ = self.links.host.push_str(&config.controller.address);
         for value in config.safe_values {
-            // Validation has refused more than there is room for.
+            // Cannot fail: validation has refused more than fit.
             let _ = self.safe_values.push(SafeBytes::new(value));
         }
         for (index, port, recipe) in config.field_ports() {
@@ -95,7 +96,7 @@ impl EngineView<'_> {
         Ok(())
     }
 
-    /// The checks that only need counts.
+    /// Checks the capacities that only need counts.
     fn check_room(&self, config: ConfigView<'_>) -> Result<(), BuildError> {
         let (mut ports, mut frames, mut inputs, mut outputs, mut commands) =
             (0_usize, 0_usize, 0_usize, 0_usize, 0_usize);
@@ -107,7 +108,7 @@ impl EngineView<'_> {
                     FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => *to,
                     _ if field.element().is_some() => InputBinding::Unused,
                     _ => {
-                        // What stands behind a field, and its scale before that.
+                        // The rules of a field, including its scale.
                         inputs = inputs.saturating_add(words_of(field).count());
                         continue;
                     }
@@ -177,7 +178,7 @@ impl EngineView<'_> {
             id: PortId(index),
             name: port.name.clone(),
             recipe: port.recipe,
-            // Those of the recipe follow.
+            // `add_codec` sets that of the recipe.
             codec: Codec::Can { input: None, output: None },
             mode: recipe.mode,
             line,
@@ -197,7 +198,7 @@ impl EngineView<'_> {
         self.store.edges.push(EdgeQueue::default()).map_err(|_| full)
     }
 
-    /// Adds the input frames of a port to the store; returns where what stands behind its bindings begins.
+    /// Adds the input frames of a port to the store; returns where the rules after its bindings begin.
     fn add_input_frames(
         &mut self,
         config: ConfigView<'_>,
@@ -213,7 +214,7 @@ impl EngineView<'_> {
                     let is_steady = exchange.when.every.is_some() || exchange.is_never();
                     (is_steady, exchange.overdue.unwrap_or(port.timeout))
                 }
-                // A pending answer or a refusal comes only when something happens.
+                // A pending answer or a refusal is not sent regularly.
                 Some((_, false)) => (false, Port::NEVER),
             };
             let fields = fields.of(config.fields);
@@ -246,7 +247,7 @@ impl EngineView<'_> {
         Ok(next_binding)
     }
 
-    /// Adds the bindings of a port's input fields; what stands behind them begins at `next_rule`.
+    /// Adds the bindings of a port's input fields; their rules begin at `next_rule`.
     fn add_inputs(
         &mut self,
         config: ConfigView<'_>,
@@ -259,13 +260,13 @@ impl EngineView<'_> {
         let mut inputs = Span { start: self.bindings.inputs.len() as u16, len: 0 };
         for (frame, nth, field) in config.fields_of(recipe, Direction::Input) {
             let Some(element) = field.element() else {
-                // Those of the field that was added last.
+                // Rules of the field that was added last.
                 let words = words_of(field).count() as u16;
                 let Some(InputBind { to, .. }) = self.bindings.inputs.last_mut().filter(|_| words > 0) else {
                     continue;
                 };
                 let new = match *to {
-                    // The scale is the first.
+                    // One more for the scale, which comes first.
                     InputTo::Variable { var, .. } => Some((var, next_rule, 0, words.saturating_add(1))),
                     InputTo::Ruled { var, first, count } => Some((var, first, u16::from(count), words)),
                     _ => None,
@@ -311,7 +312,7 @@ impl EngineView<'_> {
         Ok(inputs)
     }
 
-    /// Adds the bindings of a port's output fields, and what these may send.
+    /// Adds the bindings of a port's output fields, and what they may send.
     fn add_outputs(&mut self, config: ConfigView<'_>, recipe: &Recipe) -> Result<Span, BuildError> {
         let fields = self.bindings.outputs.capacity();
         let full = || one_too_many(Counted::UserFields, fields);
@@ -322,7 +323,7 @@ impl EngineView<'_> {
                 done.ok_or(one_too_many(Counted::Sendable, MAX_SENDABLE))?;
             }
             let Some(element) = field.element() else { continue };
-            // How constants and padding are sent is the element's business.
+            // The element has constants and padding.
             let (ty, from) = match *field {
                 FieldSpec::UserOutput { ty, from } => (ty, from),
                 FieldSpec::DeviceOutput { from, .. } => (ScalarType::Double, from),
@@ -334,7 +335,7 @@ impl EngineView<'_> {
         Ok(outputs)
     }
 
-    /// What stands behind the input fields of a port follows its bindings, in the order of the fields.
+    /// Adds the rules of a port's input fields after its bindings, in the order of the fields.
     fn add_rules(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
         let fields = self.bindings.inputs.capacity();
         let mut scale = None;
@@ -353,7 +354,7 @@ impl EngineView<'_> {
             for word in first.into_iter().chain(words) {
                 self.bindings.inputs.push(word).map_err(|_| one_too_many(Counted::UserFields, fields))?;
             }
-            // What tells whether a value was taken is 0 when its port is silent.
+            // The variable that shows whether a value was taken becomes 0 when its port is overdue.
             let FieldSpec::InputRule(InputRule::ValidTo { var, bit }) = *field else { continue };
             let mask = bit.map_or(u8::MAX, |bit| VarBit { var, bit }.mask().unwrap_or(0));
             let own = port.on_timeout.of(config.safe_values);
@@ -367,8 +368,8 @@ impl EngineView<'_> {
         Ok(())
     }
 
-    /// Lays out the frames of the port that was added last. In its place: a codec is large, and each
-    /// time that it is passed on it is copied.
+    /// Lays out the frames of the port that was added last. In place, because a codec is large and is copied each time
+    /// it is passed on.
     #[inline(never)]
     fn add_codec(&mut self, config: ConfigView<'_>, port: &Port, recipe: &Recipe) -> Result<(), BuildError> {
         let Some(own) = self.ports.last_mut() else { return Ok(()) };
@@ -454,7 +455,7 @@ impl EngineView<'_> {
             None => None,
         };
         for (_, _, field) in config.fields_of(recipe, Direction::Output) {
-            // Whether a port shows it or not: it may show that the controller has a safe value.
+            // Even if no port shows the variable: it may confirm a safe value in the controller.
             if let (Some(var), Some(group)) = (field.variable(), group)
                 && self.store.image.group(var).is_none()
             {
@@ -473,7 +474,7 @@ impl EngineView<'_> {
         let owners = writes.iter().flat_map(|var| plan.owners(var));
         let timeouts =
             owners.filter_map(|port| config.ports.get(usize::from(port.0))).map(|port| port.timeout);
-        // A port whose values are never too old has no say in it.
+        // Ports whose values never expire do not count.
         let timeouts = timeouts.filter(|timeout| *timeout != Port::NEVER);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
         let uplink = Uplink::new(UplinkSetup {
@@ -519,12 +520,12 @@ impl EngineView<'_> {
                 }
             }
         }
-        // By Modbus address, so that neighbours join into one block.
+        // Sorted by Modbus address, so that neighbours join into one block.
         let mut polled: Vec<SysVar, { crate::sysvar::COUNT }> = Vec::new();
         for var in SysVar::all().filter(|&var| plan.source(var) == Some(Source::Modbus)) {
             let before = |other: &SysVar| modbus_address(*other) <= modbus_address(var);
             let place = polled.iter().rposition(before).map_or(0, |last| last.saturating_add(1));
-            // `Vec::insert` can panic. There are as many places as variables.
+            // `Vec::insert` can panic. Cannot fail: there is room for every variable.
             let mut moved = var;
             for behind in polled.iter_mut().skip(place) {
                 core::mem::swap(behind, &mut moved);
@@ -544,7 +545,7 @@ impl EngineView<'_> {
                     self.links.recipes.iter().find(|link| link.id == id).and_then(|link| link.group)
                 }
                 Some(Source::State) => self.links.state.first_mut().map(|state| {
-                    // As many places as there are variables.
+                    // Cannot fail: there is room for every variable.
                     let _ = state.shown.push(var);
                     state.group
                 }),
@@ -564,8 +565,8 @@ impl EngineView<'_> {
         Ok(())
     }
 
-    /// The outputs that show whether the controller has a safe value of a recipe link's variable:
-    /// in the state packet, or in a recipe link's frame.
+    /// Notes which variables of a recipe link have an output that shows whether the controller has their safe value: in
+    /// the state packet, or in a recipe link's frame.
     fn assign_witnesses(&mut self) {
         let has_state = !self.links.state.is_empty();
         let image = &self.store.image;
@@ -579,8 +580,8 @@ impl EngineView<'_> {
     }
 }
 
-/// The minimum time in which a recipe frame must be acknowledged, however short the owners'
-/// timeouts are: peers acknowledge up to 200 ms late.
+/// The minimum time in which a recipe frame must be acknowledged, however short the owners' timeouts are: peers
+/// acknowledge up to 200 ms late.
 const PATIENCE: Duration = Duration::from_millis(250);
 
 fn modbus_address(var: SysVar) -> (u8, u16) {

@@ -1,5 +1,4 @@
-//! The layouts of a port's recipe, from the configuration. Those of devices' frames are made in
-//! `device_port`.
+//! The layouts of a port's recipe, from the configuration. Those of device frames are made in `field/device.rs`.
 
 use crate::config::{CanFramePart, ConfigView, FieldSpec, Recipe, StreamPart};
 use crate::engine::build_error::BuildError;
@@ -8,7 +7,7 @@ use crate::recipe::model::{Framing, Rules};
 use crate::recipe::{CanLayout, Deframer, StreamLayout};
 use crate::sysvar::Direction;
 
-/// The layouts of a stream recipe, in the place of the port's.
+/// Makes the layouts of a stream recipe in place.
 #[inline(never)]
 pub(crate) fn stream_codec(
     config: ConfigView<'_>,
@@ -28,7 +27,6 @@ pub(crate) fn stream_codec(
     Ok(())
 }
 
-/// The layout of one part, if there is one.
 pub(crate) fn stream_layout(
     config: ConfigView<'_>,
     index: u8,
@@ -47,7 +45,7 @@ pub(crate) fn stream_layout(
     }
 }
 
-/// The layouts of a CAN recipe, in the place of the port's.
+/// Makes the layouts of a CAN recipe in place.
 #[inline(never)]
 pub(crate) fn can_codec(
     config: ConfigView<'_>,
@@ -77,7 +75,6 @@ pub(crate) fn can_codec(
     Ok(())
 }
 
-/// The index of a recipe.
 pub(crate) fn index_of(config: ConfigView<'_>, recipe: &Recipe) -> u8 {
     (0..).zip(config.recipes).find(|(_, other)| other.name == recipe.name).map_or(0, |(index, _)| index)
 }

@@ -22,8 +22,7 @@ use crate::sysvar::Direction;
 use crate::time::{Duration, Instant};
 use crate::wire::can::{CanId, CanKey};
 
-/// Where the next fields are among the bindings of their direction, and the next input frame in the
-/// store.
+/// Where the next fields go among the bindings of their direction, and the next input frame in the store.
 pub(crate) struct Places {
     pub inputs: u16,
     pub outputs: u16,
@@ -35,13 +34,13 @@ struct Formats<'c> {
     config: ConfigView<'c>,
     recipe: u8,
     places: Places,
-    /// Frames of each direction so far, for messages.
+    /// Number of frames of each direction so far, for messages.
     frames: [u8; 2],
-    /// The bindings of all ports, which refusals are added to.
+    /// The input bindings of all ports; those of refusals are appended.
     refusals: &'c mut VecView<InputBind>,
 }
 
-/// Where a frame's fields are.
+/// The source of a frame's fields.
 #[derive(Clone, Copy)]
 enum FrameOf<'c> {
     /// The data of Modbus registers or coils.
@@ -96,7 +95,7 @@ impl Formats<'_> {
         Ok(OtherFormat { format: self.without_values(spec)?, slot: None })
     }
 
-    /// One without values, whose fields are behind those of the recipe.
+    /// The format of such a frame without values; its bindings come after those of the recipe.
     fn without_values(&mut self, spec: &FrameSpec) -> Result<DeviceFormat, BuildError> {
         let (recipe, part, [frames, _]) = (self.recipe, Direction::Input, self.frames);
         let frame = spec.layout(self.config, part);
@@ -121,7 +120,7 @@ impl Formats<'_> {
         self.format(Direction::Output, FrameOf::Data(fields)).map(Some)
     }
 
-    /// The same for those that are received.
+    /// The data of Modbus registers or coils that are received.
     fn data_in(&mut self, span: Span) -> Result<Option<InputFormat>, BuildError> {
         let fields: &[FieldSpec] = span.of(self.config.fields);
         if fields.is_empty() {
@@ -130,7 +129,7 @@ impl Formats<'_> {
         self.input(FrameOf::Data(fields)).map(Some)
     }
 
-    /// Bytes of a reply to a remote request.
+    /// Length in bytes of the reply to a remote request.
     fn longest_of(&self, spec: &FrameSpec) -> usize {
         spec.layout(self.config, Direction::Input).map_or(0, |frame| frame.layout.lengths().1)
     }
@@ -201,8 +200,7 @@ impl Formats<'_> {
 }
 
 impl EngineView<'_> {
-    /// Adds the exchanges of a port, whose fields and input frames behind those of its parts are at
-    /// these places.
+    /// Adds the exchanges of a port. Their fields and input frames come after those of its parts, at these places.
     #[inline(never)]
     pub(crate) fn add_exchanges(
         &mut self,
@@ -220,7 +218,7 @@ impl EngineView<'_> {
         let frames = [part_frames(Direction::Input), part_frames(Direction::Output)];
         let refusals = &mut *self.bindings.inputs;
         let mut formats = Formats { config, recipe: port.recipe, places, frames, refusals };
-        // One that is asked at the start may have to wait for its values.
+        // A start exchange may have to wait for its values.
         let may_wait = |exchange: &Exchange| {
             exchange.when.start && exchange.fields(config.frames, Direction::Output).is_some()
         };
@@ -245,7 +243,7 @@ impl EngineView<'_> {
             let kept = match (item.asks, &item.reply) {
                 (Asks::Served { .. }, Some(block)) => block.format.layout.lengths().1,
                 (Asks::Served { .. }, None) => 0,
-                // Escape bytes double a frame at most; there are none beside exchanges.
+                // Escape bytes could double a frame; recipes with exchanges have none.
                 _ if exchange.is_event() => request_len,
                 _ => 0,
             };
@@ -284,13 +282,13 @@ impl EngineView<'_> {
                 retries: [exchange.retries, exchange.event_retries],
             };
             let pause = match item.asks {
-                // The slaves carry it out, and nobody says when they have.
+                // A broadcast has no reply, so the slaves get time to execute it.
                 Asks::Rtu { slave: BROADCAST, .. } => exchange.pause + Timing::TURNAROUND,
                 _ => exchange.pause,
             };
             let times = Times { cost, timeout: exchange.timeout, late: exchange.late(), pause };
             let mut row = Row::new(peer as u8, kind, exchange.when.every, times);
-            // A transaction id tells all replies apart.
+            // Over TCP, the transaction id distinguishes all replies.
             row.alike = if is_tcp { 0 } else { config.waits_for(recipe, exchange) };
             self.exchanges.rows.push(row).map_err(|_| full())?;
             self.exchanges.items.push(item).map_err(|_| full())?;
@@ -308,7 +306,7 @@ impl EngineView<'_> {
     }
 }
 
-/// The step before an exchange that is triggered by the same bit as an earlier one of its peer: they are one dialogue.
+/// The previous exchange of the same peer that the same bit triggers: together they are steps of one event.
 fn step_before(exchanges: &[Exchange], nth: usize) -> Option<u8> {
     let own = exchanges.get(nth).filter(|own| own.when.rising.is_some() && !own.stop)?;
     let is_step =

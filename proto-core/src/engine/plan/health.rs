@@ -1,4 +1,4 @@
-//! The health of ports and links that a configuration shows: places among extra values, and variables.
+//! The health of ports and links that a configuration shows: their places among extra values, and variables.
 
 use super::build::Groups;
 use crate::config::{ConfigView, Counted, LinkSource, OutputBinding};
@@ -12,8 +12,7 @@ use crate::time::Instant;
 use crate::wire::dialect::Dialect;
 
 impl EngineView<'_> {
-    /// Gives values of the state packet and of the health of ports their places among the image's
-    /// extra values.
+    /// Gives values of the state packet and of the health of ports their places among the image's extra values.
     pub(crate) fn assign_extra(&mut self, dialect: &Dialect) -> Result<(), BuildError> {
         let mut used = 0_u8;
         let mut next = || {
@@ -36,7 +35,7 @@ impl EngineView<'_> {
                             (Some(extra), _) => extra,
                             (None, Ok((offset, ty))) => {
                                 let extra = next()?;
-                                // As many places as there are extra values.
+                                // Cannot fail: there is room for every extra value.
                                 let _ = state.kept.push(Kept { value, extra, offset, ty });
                                 extra
                             }
@@ -56,7 +55,7 @@ impl EngineView<'_> {
                                     Some(id) => self.ports.iter().position(|other| other.id.0 == id),
                                     None => Some(index),
                                 };
-                                // Validation has refused other ports.
+                                // Validation has refused unknown ports.
                                 Of::Port(of.unwrap_or(index) as u8, value)
                             }
                             _ => continue,
@@ -67,14 +66,14 @@ impl EngineView<'_> {
                             Some(extra) => extra,
                             None => {
                                 let extra = next()?;
-                                // As many places as there are extra values.
+                                // Cannot fail: there is room for every extra value.
                                 let _ = self.health.shown.push(Shown { of, extra });
                                 extra
                             }
                         };
                         if let Some(port) = self.ports.get_mut(index) {
                             port.sender.shows_health = true;
-                            // Without a cycle, a frame is made when another one has come.
+                            // Without a cycle, a frame is made when another one has arrived.
                             let has_cycle = port.sender.next_cycle(Instant::ZERO) != Instant::NEVER;
                             self.store.watches_bits |= !has_cycle;
                         }
@@ -87,7 +86,7 @@ impl EngineView<'_> {
         Ok(())
     }
 
-    /// Notes the variables that tell the health of ports.
+    /// Notes the variables that report the health of ports.
     pub(crate) fn assign_health(
         &mut self,
         config: ConfigView<'_>,
@@ -106,7 +105,7 @@ impl EngineView<'_> {
                 self.store.health.insert(var);
             }
             for (value, var) in port.health.iter() {
-                // There is room for every value of every port.
+                // Cannot fail: there is room for every value of every port.
                 let _ = self.health.variables.push(HealthVariable { port: nth, value, var, last: None });
             }
         }

@@ -1,7 +1,7 @@
-//! The plan: the way of each variable (docs/engine.md section 4).
+//! The plan: the route of each variable (docs/engine.md section 4).
 //!
-//! In: a configuration. Out: the owner and way up of every input variable, and the source of every
-//! variable that a port shows. Decided once; it does not change while the engine runs.
+//! In: a configuration. Out: the owner and route of every input variable, and the source of every variable that a port
+//! shows. Decided once; it does not change while the engine runs.
 
 use crate::engine::build_error::PlanError;
 
@@ -19,10 +19,10 @@ pub enum Route {
     Modbus,
 }
 
-/// Where a variable that a port shows comes from.
+/// The source of a variable that a port shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Source {
-    /// Frames of a recipe link, each cycle.
+    /// Frames of a recipe link, one each cycle.
     Recipe(LinkId),
     /// Modbus polls.
     Modbus,
@@ -32,7 +32,7 @@ pub enum Source {
     Field(PortId),
 }
 
-/// Owner, way up and source of every variable.
+/// Owner, route and source of every variable.
 #[derive(Debug, Clone)]
 pub struct Plan {
     owners: [Option<PortId>; INPUT_COUNT],
@@ -48,7 +48,7 @@ impl Plan {
     /// Makes the plan of a configuration.
     ///
     /// # Errors
-    /// [`PlanError`] names the first variable without a way.
+    /// [`PlanError`] names the first variable without a route, source or single owner.
     pub fn new<'c>(config: impl Into<ConfigView<'c>>) -> Result<Self, PlanError> {
         Self::of(config.into())
     }
@@ -95,7 +95,7 @@ impl Plan {
         Ok(plan)
     }
 
-    /// The field port that owns a bit of a variable, or the whole variable.
+    /// The field port that owns a bit, on its own or with the whole variable.
     pub fn bit_owner(&self, bit: VarBit) -> Option<PortId> {
         let bits = self.bit_owners.get(bit.var.ordinal());
         let owner = bits.and_then(|bits| bits.get(usize::from(bit.bit)).copied().flatten());
@@ -113,28 +113,27 @@ impl Plan {
         self.owners.get(var.ordinal()).copied().flatten()
     }
 
-    /// How an input variable that is owned, or some of whose bits are, reaches the controller.
+    /// The route of an input variable that has an owner, or bits with owners.
     pub fn route(&self, var: SysVar) -> Option<Route> {
         self.ways.get(var.ordinal()).copied().flatten()
     }
 
-    /// Where a variable that some port shows comes from.
+    /// The source of a variable that a port shows.
     pub fn source(&self, var: SysVar) -> Option<Source> {
         self.sources.get(var.ordinal()).copied().flatten()
     }
 
-    /// Input variables that share a recipe link's frame. Their present values are read back from
-    /// the state stream as long as no port sends them.
+    /// Input variables that share a recipe link's frame. Their present values are read back from the state stream as
+    /// long as no port sends them.
     pub(crate) fn read_back(&self) -> InputSet {
         self.read_back
     }
 
-    /// Whether the 2001 stream is needed.
+    /// Whether the stream of port 2001 is needed.
     pub(crate) fn needs_state(&self) -> bool {
         self.shows_state || !self.read_back.is_empty() || self.sources.contains(&Some(Source::State))
     }
 
-    /// Whether Modbus is needed.
     pub(crate) fn needs_modbus(&self) -> bool {
         self.ways.contains(&Some(Route::Modbus)) || self.sources.contains(&Some(Source::Modbus))
     }
@@ -210,13 +209,12 @@ fn field_ports<'c>(config: ConfigView<'c>) -> impl Iterator<Item = (PortId, &'c 
     config.field_ports().map(|(port, _, recipe)| (PortId(port), recipe))
 }
 
-/// The input variables that a recipe's input part sets.
 fn inputs_of<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     config.written_by(recipe)
 }
 
-/// Whether a recipe link's frame carries exactly the variables of one field frame, all of them with
-/// safe values or none. Then all of them are known whenever one is written.
+/// Whether a recipe link's frame has exactly the variables of one field frame, all with safe values or none. Then all
+/// of them are known whenever one is written.
 fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     config.field_ports().any(|(_, port, recipe)| {
         config.frames_of(recipe, Direction::Input).any(|(_, fields)| {
@@ -230,8 +228,8 @@ fn is_one_frame(config: ConfigView<'_>, link: &Recipe) -> bool {
     })
 }
 
-/// The variables that a recipe's output part shows, and the one whose bit triggers it; those of
-/// exchanges are looked at when they are asked.
+/// The variables that a recipe's output part shows, and the one whose bit triggers it. Those of exchanges are checked
+/// when their requests are made.
 pub(crate) fn sent_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     let trigger = match recipe.send {
         SendOn::Rising { var, .. } => Some(var),
@@ -241,8 +239,7 @@ pub(crate) fn sent_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl It
     fields.flat_map(FieldSpec::variables).chain(trigger)
 }
 
-/// The variables that a recipe's outputs show, those of its exchanges too, and those whose bits
-/// trigger them.
+/// The variables that a recipe's outputs and requests show, and those whose bits trigger them.
 pub(crate) fn shown_by<'a>(config: ConfigView<'a>, recipe: &'a Recipe) -> impl Iterator<Item = SysVar> + 'a {
     let exchanges = config.exchanges_of(recipe).iter();
     let requests =
