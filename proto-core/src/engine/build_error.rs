@@ -15,7 +15,7 @@ use crate::wire::dialect::Dialect;
 pub enum BuildError {
     /// The configuration is invalid.
     Config(ConfigError),
-    /// A variable has no way.
+    /// A variable has no route, no source, or no single owner.
     Plan(PlanError),
     /// A recipe's part is invalid.
     Part {
@@ -26,7 +26,7 @@ pub enum BuildError {
         /// What is wrong.
         error: PartError,
     },
-    /// A device's frame cannot be laid out.
+    /// A device frame cannot be laid out.
     Layout {
         /// Index of the recipe.
         recipe: u8,
@@ -37,14 +37,13 @@ pub enum BuildError {
         /// What is wrong.
         error: LayoutError,
     },
-    /// There is no dialect of the configured name.
+    /// There is no dialect with the configured name.
     UnknownDialect,
-    /// The configuration needs more entries than this engine has room for.
+    /// The configuration has more entries than this engine has room for.
     TooMany {
-        /// The list.
+        /// The kind of entries.
         what: Counted,
-        /// Number of entries that the configuration needs; if only building it shows that, one more
-        /// than there is room for.
+        /// Number of entries needed; one more than `room` if only building shows that they do not fit.
         needed: usize,
         /// Number of entries there is room for.
         room: usize,
@@ -75,12 +74,12 @@ impl fmt::Display for BuildError {
 
 impl core::error::Error for BuildError {}
 
-/// There was no room for another entry.
+/// The error for one entry more than there is room for.
 pub(super) fn one_too_many(what: Counted, room: usize) -> BuildError {
     BuildError::TooMany { what, needed: room.saturating_add(1), room }
 }
 
-/// Why a variable has no way.
+/// Why a variable has no route, no source, or no single owner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PlanError {
@@ -90,7 +89,7 @@ pub enum PlanError {
         var: SysVar,
         /// The port that writes it first.
         first: PortId,
-        /// The other.
+        /// The other port.
         second: PortId,
     },
     /// Two ports write the same bit.
@@ -99,7 +98,7 @@ pub enum PlanError {
         bit: VarBit,
         /// The port that writes it first.
         first: PortId,
-        /// The other.
+        /// The other port.
         second: PortId,
     },
     /// One port writes the whole variable, and another one of its bits.
@@ -111,7 +110,7 @@ pub enum PlanError {
         /// The port that writes the bit.
         part: PortId,
     },
-    /// No configured way up can carry the input variable (D15).
+    /// No configured route can carry the input variable (D15).
     NoRoute {
         /// The variable.
         var: SysVar,
@@ -125,8 +124,8 @@ pub enum PlanError {
         /// The port that shows it.
         port: PortId,
     },
-    /// A recipe link's frame carries a variable that no port sends and that cannot be read back:
-    /// its value would have to be invented.
+    /// A recipe link's frame has a variable that no port sends and that cannot be read back: its value would have to be
+    /// invented.
     NobodySends {
         /// The variable.
         var: SysVar,

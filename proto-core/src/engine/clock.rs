@@ -65,12 +65,12 @@ impl Clock {
 }
 
 impl Clock {
-    /// Whether the engine is asleep at `now`, with no deadline or heartbeat passed.
+    /// Whether the engine is asleep at `now`: the announced deadline or heartbeat is still to come.
     pub(super) fn is_idle(&self, now: Instant) -> bool {
         now >= self.now && now < self.idle_until
     }
 
-    /// Like [`Self::is_idle`], but also for an engine without ports, which is not called at every heartbeat.
+    /// Like [`Self::is_idle`], and no heartbeat has passed: an engine without ports may sleep beyond one.
     pub(super) fn is_asleep(&self, now: Instant) -> bool {
         self.is_idle(now) && now < self.beat_at
     }

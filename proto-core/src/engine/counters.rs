@@ -14,9 +14,9 @@ pub struct PortCounters {
     pub frames_out: u32,
     /// Bytes handed over to the driver (CAN: data bytes).
     pub bytes_out: u32,
-    /// Frames rejected for a value that is not finite (D22); of a device's frames, those of which no value was taken.
+    /// Frames rejected because a value is not finite (D22); for device frames, those of which no value was taken.
     pub rejected_not_finite: u32,
-    /// The same because a bound value did not fit its variable (D22).
+    /// Likewise, because a bound value did not fit its variable (D22).
     pub rejected_out_of_range: u32,
     /// CAN frames ignored because the recipe does not have their id (D17).
     pub rejected_id: u32,
@@ -26,17 +26,16 @@ pub struct PortCounters {
     pub rejected_remote: u32,
     /// Frames rejected because their checksum is wrong.
     pub rejected_checksum: u32,
-    /// The same because a field is not a number, such as a letter among digits.
+    /// Likewise, because a field is not a number, such as a letter among digits.
     pub rejected_unreadable: u32,
-    /// Frames that are right and of another device: a constant is not ours.
+    /// Valid frames of another device: a constant differs.
     pub rejected_other_device: u32,
-    /// Frames rejected because their alive counter is that of the frame before: the device may be
-    /// frozen.
+    /// Frames rejected because their alive counter repeats that of the previous frame: the device may be frozen.
     pub rejected_counter: u32,
-    /// Fields of accepted frames of devices that were rejected: a value that does not fit, is not finite, or is not a
+    /// Fields of accepted device frames that were rejected: a value that does not fit, is not finite, or is not a
     /// number.
     pub rejected_fields: u32,
-    /// Fields of accepted frames that have no value now, as the device says.
+    /// Fields of accepted frames for which the device reports that it has no value now.
     pub fields_without_value: u32,
     /// Frames received on a port whose recipe has no input part.
     pub rejected_no_input: u32,
@@ -44,41 +43,39 @@ pub struct PortCounters {
     pub tail_mismatches: u32,
     /// Bytes dropped while looking for a frame (D19).
     pub resync_bytes: u32,
-    /// Bytes of partial frames discarded after silence (D19), and bytes discarded because they
-    /// waited while the gateway itself slept.
+    /// Bytes of partial frames discarded after silence (D19), and bytes discarded because they waited while the gateway
+    /// itself slept.
     pub discarded_bytes: u32,
-    /// Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself
-    /// slept.
+    /// Chunks of bytes, or CAN frames, discarded because they waited while the gateway itself slept.
     pub asleep: u32,
     /// Accepted frames in which reserved bits were masked (D22).
     pub masked: u32,
-    /// Accepted frames whose alive counter is not the next one: frames between are missing.
+    /// Accepted frames whose alive counter is not the next one: frames are missing before them.
     pub counter_jumps: u32,
-    /// Frames with a text that is ignored, such as that of a scanner that read nothing.
+    /// Frames with a text that is configured to be ignored, such as that of a scanner that read nothing.
     pub ignored: u32,
     /// Bit values replaced by newer ones because the queue of edges was full.
     pub edges_lost: u32,
-    /// Values dropped before they were written: older than the port's timeout, or waiting for a
-    /// link that was lost.
+    /// Values dropped before they were written: older than the port's timeout, or waiting for a link that was lost.
     pub values_expired: u32,
     /// Accepted frames with a value that was dropped because its link was down.
     pub undelivered: u32,
-    /// Accepted frames with a value that was withheld until its neighbours were read back.
+    /// Accepted frames with a value that was withheld until other variables were read back.
     pub withheld: u32,
     /// Cycles in which no output frame could be sent in time (D20).
     pub skipped_cycles: u32,
-    /// Cycles in which no output frame was sent because its sources were stale or unknown, or because a field
-    /// could not have its value.
+    /// Cycles in which no output frame was sent because its sources were stale or unknown, or because a field could not
+    /// have its value.
     pub stale_cycles: u32,
     /// Requests without a good reply, after all repetitions.
     pub unanswered: u32,
     /// Requests that the device refused.
     pub refused: u32,
-    /// Times an input frame became overdue.
+    /// Times that an input frame became overdue.
     pub timeouts: u32,
-    /// Times the device was reported gone.
+    /// Times that the device was reported gone.
     pub downs: u32,
-    /// Times the CAN controller was reported bus-off.
+    /// Times that the CAN controller was reported bus-off.
     pub bus_offs: u32,
     /// Commands picked by a value.
     pub commands: u32,
@@ -86,8 +83,8 @@ pub struct PortCounters {
     pub commands_dropped: u32,
     /// Values that are in no command table: neither a command nor idle.
     pub commands_unknown: u32,
-    /// Values that would have picked a command, but only set the base: the first ones after the
-    /// start, silence or a lost device.
+    /// Values that would have picked a command but only set the base: the first ones after the start, silence or a lost
+    /// device.
     pub commands_based: u32,
 }
 
@@ -99,39 +96,37 @@ pub struct PortCounters {
 pub struct LinkCounters {
     /// Requests, frames or commands sent.
     pub sent: u32,
-    /// Answers, frames or packets accepted.
+    /// Replies, frames or packets accepted.
     pub received: u32,
     /// Bytes received.
     pub bytes_in: u32,
-    /// Requests without an answer within the timeout.
+    /// Requests without a reply within the timeout.
     pub timeouts: u32,
     /// Exceptions and failure replies.
     pub refused: u32,
-    /// Malformed answers, frames and packets.
+    /// Malformed replies, frames and packets.
     pub malformed: u32,
-    /// Received values that were not finite; the variables are unknown until a readable value
-    /// comes.
+    /// Received values that were not finite; the variables are unknown until a readable value arrives.
     pub unreadable: u32,
-    /// Connections reset because the peer's transport had not acknowledged data before its
-    /// deadline.
+    /// Connections reset because the peer's transport had not acknowledged data before its deadline.
     pub unacknowledged: u32,
     /// Bytes dropped while looking for a frame.
     pub resync_bytes: u32,
-    /// Time from the newest request to its answer, in microseconds.
+    /// Time from the newest request with a reply to that reply, in microseconds.
     pub round_trip_us: u32,
-    /// The longest such time, in microseconds.
+    /// The longest round trip, in microseconds.
     pub round_trip_max_us: u32,
 }
 
 impl PortCounters {
-    /// A frame of so many bytes was handed over.
+    /// Counts a frame of `len` bytes that was handed over.
     pub(super) fn sent(&mut self, len: usize) {
         bump(&mut self.frames_out);
         add(&mut self.bytes_out, len);
     }
 
-    /// Frames that were rejected, for whatever reason. Frames of a CAN bus that are for other nodes are not among them:
-    /// [`Self::rejected_id`] and [`Self::rejected_remote`] count on a bus where all is well. It wraps.
+    /// Number of rejected frames, for any reason; wraps. Does not include CAN frames for other nodes:
+    /// [`Self::rejected_id`] and [`Self::rejected_remote`] also count on a healthy bus.
     pub fn rejected(&self) -> u32 {
         let all = [
             self.rejected_not_finite,
@@ -164,7 +159,7 @@ impl LinkCounters {
         round_trip_max_us: 0,
     };
 
-    /// Counts an answer that came `micros` after its request.
+    /// Counts a reply that arrived `micros` after its request.
     pub(super) fn answered(&mut self, micros: u32) {
         bump(&mut self.received);
         self.round_trip_us = micros;
@@ -172,12 +167,10 @@ impl LinkCounters {
     }
 }
 
-/// Adds one.
 pub(super) fn bump(counter: &mut u32) {
     add(counter, 1);
 }
 
-/// Adds `n`.
 pub(super) fn add(counter: &mut u32, n: usize) {
     *counter = counter.wrapping_add(n as u32);
 }

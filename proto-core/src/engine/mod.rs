@@ -89,7 +89,7 @@ const _: () = assert!(INPUT_BUFFER >= LEN && INPUT_BUFFER > MAX_STREAM_FRAME);
 /// all ports; 0 costs nothing. The defaults are the maximum of a configuration file.
 ///
 /// `Engine<4, 1, 128, 0, 0>` takes less than 42 KiB.
-// An engine is larger than the address range of one instruction, so what every call reads comes first, and what only
+// An engine is larger than the offset range of a load instruction, so what every call reads comes first, and what only
 // some configurations have comes last.
 #[derive(Debug, Clone)]
 #[repr(C)]

@@ -1,16 +1,16 @@
-//! Why input on a port or link was rejected, as counters, tap and status report it.
+//! Why input on a port or link was rejected, for counters, tap and status.
 
 use crate::sysvar::SysVar;
 use crate::time::{Duration, Instant};
 use crate::wire::can::CanId;
 
-/// Why a frame, packet or answer was rejected, and nothing of it applied; or a field of a device's frame.
+/// Why a frame, packet or reply was rejected as a whole, or a field of a device frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
 #[non_exhaustive]
 pub enum Rejection {
-    /// Bytes in which no frame begins, or that a wrong tail ends (D19).
+    /// Bytes in which no frame begins, or whose frame has a wrong tail (D19).
     NoFrame,
     /// A partial frame that silence ended (D19).
     Partial,
@@ -24,11 +24,11 @@ pub enum Rejection {
     WrongLength,
     /// A remote frame (D17).
     Remote,
-    /// A checksum that is wrong.
+    /// A wrong checksum.
     Checksum,
     /// A field that is not a number, such as a letter among digits.
     Unreadable,
-    /// A frame of another device: a constant is not ours.
+    /// A frame of another device: a constant differs.
     OtherDevice,
     /// The recipe has no input part.
     NoInput,
@@ -36,13 +36,13 @@ pub enum Rejection {
     Asleep,
     /// It violates the link's protocol.
     Malformed,
-    /// Escape bytes that mean nothing.
+    /// Invalid escape bytes.
     Escape,
-    /// The device refuses a request.
+    /// The device refuses the request.
     Refused,
-    /// An alive counter that the frame before had, too.
+    /// The same alive counter as in the previous frame.
     Repeated,
-    /// A reply that came too late, or that answers one of several requests.
+    /// A reply that arrived too late, or that may answer any of several requests.
     Late,
 }
 
@@ -92,24 +92,24 @@ impl Rejection {
     }
 }
 
-/// A field of a device's frame that was rejected, with or without the rest of its frame.
+/// A rejected field of a device frame; the rest of the frame may have been accepted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub struct RejectedField {
     /// Index of the frame among the recipe's input frames; those of exchanges follow those of the input part.
     pub frame: u8,
-    /// Index of the field in the frame, in the order of the wire; checksums do not count.
+    /// Index of the field in the frame, in wire order; checksums do not count.
     pub field: u8,
-    /// The variable that the value is for; the first one of a text.
+    /// The variable that the value is for; for a text, the first one.
     pub var: Option<SysVar>,
-    /// The number that the frame had, before scale and offset; `None` if it could not be read, and for a text.
+    /// The number in the frame, before scale and offset; `None` if it could not be read, and for a text.
     pub value: Option<f64>,
-    /// The lowest and the highest number that is taken, in the same unit; `None` where the field can have no other ones, or
-    /// the numbers are no range.
+    /// The lowest and the highest number that is taken, in the same unit; `None` if the field cannot have other ones,
+    /// or if the numbers are not one range.
     pub allowed: Option<(f64, f64)>,
 }
 
-/// The same as the engine keeps it.
+/// A rejected field, as the engine keeps it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct FieldRejection {
     pub value: f64,
@@ -118,25 +118,24 @@ pub(super) struct FieldRejection {
     pub why: Rejection,
 }
 
-/// Number of bytes of a rejection that are kept.
+/// Number of bytes kept of a rejected frame.
 pub const KEPT_BYTES: usize = 32;
 
-/// The newest rejection of a port, with the first [`KEPT_BYTES`] of the rejected bytes.
+/// The newest rejection of a port, with the first [`KEPT_BYTES`] rejected bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LastRejection {
-    /// When it was; for bytes without a frame, when the first came.
+    /// When the input was rejected; for bytes without a frame, when the first arrived.
     pub at: Instant,
     /// The reason.
     pub why: Rejection,
     /// The frame's id on a CAN bus.
     pub can_id: Option<CanId>,
-    /// Length of the rejected frame or bytes; only the first bytes are kept. For
-    /// [`Rejection::NoFrame`] it is the number of bytes that belong to no frame, and the kept bytes
-    /// are those of the chunks with them.
+    /// Length of the rejected frame or bytes, even if fewer are kept. For [`Rejection::NoFrame`] it is the number of
+    /// bytes that belong to no frame, and the kept bytes are those of the chunks that contain them.
     pub len: usize,
-    /// The field that was rejected, if it was one of a device's frame.
+    /// The rejected field, if it was one of a device frame.
     pub(super) field: Option<FieldRejection>,
-    /// When its newest bytes came.
+    /// When its newest bytes arrived.
     newest_at: Instant,
     kept: u8,
     bytes: [u8; KEPT_BYTES],
@@ -166,13 +165,12 @@ impl LastRejection {
         Self { len: skipped, ..Self::new(at, Rejection::NoFrame, None, bytes) }
     }
 
-    /// Whether bytes without a frame at `now` belong to this rejection: there was no silence
-    /// between.
+    /// Whether bytes without a frame at `now` belong to this rejection, because there was no silence between them.
     pub(super) fn goes_on(&self, now: Instant, idle_gap: Duration) -> bool {
         self.why == Rejection::NoFrame && now.saturating_since(self.newest_at) <= idle_gap
     }
 
-    /// More of the same: `skipped` bytes, in a chunk of `bytes`.
+    /// Adds `skipped` further bytes, in a chunk of `bytes`.
     pub(super) fn append(&mut self, now: Instant, skipped: usize, bytes: &[u8]) {
         let free = self.bytes.iter_mut().skip(usize::from(self.kept));
         let added = free.zip(bytes).map(|(kept, &byte)| *kept = byte).count();
@@ -181,7 +179,7 @@ impl LastRejection {
         self.newest_at = now;
     }
 
-    /// The first bytes of the rejected frame or bytes.
+    /// The first rejected bytes.
     pub fn bytes(&self) -> &[u8] {
         self.bytes.get(..usize::from(self.kept)).unwrap_or(&[])
     }

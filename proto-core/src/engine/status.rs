@@ -1,9 +1,8 @@
-//! A snapshot of a running gateway. Statistics, log lines, the status LED, an API and metrics are
-//! all made from it.
+//! A snapshot of a running gateway, from which statistics, log lines, the status LED, an API and metrics are made.
 //!
-//! In: the engine, at one instant. Out: ports, links, variables, the controller's states, latency.
-//! It is a view: making it costs a few pointers, and each part is computed on request. Unknown
-//! values are absent, never 0.
+//! In: the engine, at one instant. Out: ports, links, variables, the controller's states, latency. It is a view: making
+//! it costs a few pointers, and each part is computed on request. Unknown values are absent, never 0. Does not know how
+//! it is shown.
 
 use core::fmt;
 
@@ -41,7 +40,7 @@ pub struct Status<'a> {
     pub(super) frames: &'a [InputFrame],
     pub(super) health: &'a PortsHealth,
     pub(super) image: &'a Image,
-    /// Those of all ports.
+    /// The input bindings of all ports.
     pub(super) inputs: &'a [InputBind],
     pub(super) bits: &'a Bits,
     pub(super) links: LinksView<'a>,
@@ -57,7 +56,7 @@ pub struct Status<'a> {
 pub enum FieldBus {
     /// A serial line.
     Rs485,
-    /// A connection of Modbus TCP.
+    /// A Modbus TCP connection.
     ModbusTcp,
     /// A CAN bus.
     Can {
@@ -66,7 +65,7 @@ pub enum FieldBus {
     },
 }
 
-/// The gateway's condition for an indicator such as a lamp, the worst first.
+/// The gateway's condition for an indicator such as an LED, the worst first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -82,7 +81,7 @@ pub enum Health {
 }
 
 impl Health {
-    /// One word for it, as in the documents of the API and in Sparkplug.
+    /// One word, as in the documents of the API and in Sparkplug.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Idle => "idle",
@@ -109,45 +108,45 @@ pub struct PortStatus<'a> {
     pub state: PortState,
     /// Age of the newest accepted frame; for a CAN recipe, of any id. `None` before the first.
     pub age: Option<Duration>,
-    /// Number of its input frames that are overdue or have never come.
+    /// Number of its input frames that are overdue or have never arrived.
     pub overdue: usize,
-    /// Result of the newest command that one of its values picked.
+    /// Result of the newest command that its values picked.
     pub reply: ReplyCode,
-    /// That command, such as `run(pick.jspf)`.
+    /// The newest command that its values picked, such as `run(pick.jspf)`.
     pub command: Option<CommandText<'a>>,
     /// The newest value that gave no command, and why.
     pub last_dropped: Option<&'a DroppedCommand>,
-    /// The newest of its commands that the controller replied to with a failure.
+    /// The newest of its commands that the controller answered with a failure.
     pub last_failed: Option<FailedCommand<'a>>,
-    /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a
-    /// shared bus it is for another node.
+    /// The newest rejection. A CAN frame with an unknown id replaces no other rejection: on a shared bus it is for
+    /// another node.
     pub last_rejection: Option<&'a LastRejection>,
-    /// The field of a device's frame that it was, with or without the rest of the frame.
+    /// The rejected field, if `last_rejection` is that of a device frame's field.
     pub rejected_field: Option<RejectedField>,
     /// Counters since the start.
     pub counters: &'a PortCounters,
     peers: &'a [PeerState],
-    /// The instant of the snapshot: ages count from it.
+    /// The instant of the snapshot, for ages.
     #[cfg(feature = "serde")]
     pub(super) at: Instant,
 }
 
-/// A slave, or another peer that exchanges of a port are with.
+/// A slave or other peer of a port's exchanges.
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub struct PeerStatus {
-    /// Its address, or its number in the configuration; 0 on Modbus stands for all slaves.
+    /// Its address, or its number in the configuration; on Modbus, 0 stands for all slaves.
     pub number: u8,
-    /// Whether it answers; [`Presence::Unknown`] if it is never asked for an answer.
+    /// Whether it answers; [`Presence::Unknown`] if it is never asked for a reply.
     pub presence: Presence,
-    /// Periods that went by while it was not down, because the line had too much to do.
+    /// Periods missed while it was not down, because the line was overloaded.
     pub missed_periods: u32,
     /// Counters since the start.
     pub counters: PeerCounters,
 }
 
 impl<'a> PortStatus<'a> {
-    /// The same without its peers, of which there may be dozens: for a document that is written in pieces.
+    /// The same status without its peers, of which there may be dozens, for documents that are written in pieces.
     pub fn without_peers(self) -> Self {
         Self { peers: &[], ..self }
     }
@@ -175,7 +174,7 @@ pub struct VariableStatus<'a> {
     pub age: Duration,
     /// The field port that owns an input variable; `None` for a value from the controller.
     pub owner: Option<&'a str>,
-    /// The bit that the value and the owner are of, in a byte of whose bits each has its owner.
+    /// The bit that value and owner belong to, if the bits of the variable have owners.
     pub bit: Option<u8>,
 }
 
@@ -221,12 +220,12 @@ impl<'a> Status<'a> {
         })
     }
 
-    /// The known variables, in the order of the table; then bits with owners of their own.
+    /// The known variables, in the order of the table; then the known bits with owners.
     pub fn variables(self) -> impl Iterator<Item = VariableStatus<'a>> {
         self.whole_variables().chain(self.bits())
     }
 
-    /// The known bits with owners of their own.
+    /// The known bits with owners.
     pub fn bits(self) -> impl Iterator<Item = VariableStatus<'a>> {
         self.bits.shares().iter().flat_map(move |share| {
             let at = self.image.stamp_of(share.group());
@@ -249,7 +248,7 @@ impl<'a> Status<'a> {
         SysVar::all().filter_map(move |var| self.variable(var))
     }
 
-    /// A variable as a whole; `None` if it is unknown, or unreadable.
+    /// A variable as a whole; `None` if it is unknown or unreadable.
     pub fn variable(self, var: SysVar) -> Option<VariableStatus<'a>> {
         let age = self.image.age(var, self.at)?;
         self.image.is_readable(var).then(|| VariableStatus {
@@ -269,7 +268,7 @@ impl<'a> Status<'a> {
         Some(ControllerStatus { states, age: self.at.saturating_since(at) })
     }
 
-    /// The worst present condition.
+    /// The gateway's present condition.
     pub fn health(&self) -> Health {
         // Another link carries the traffic of a shared one.
         let is_up = |link: LinkInfo<'_>| matches!(link.state, LinkState::Up { .. } | LinkState::Shared);
@@ -290,7 +289,7 @@ impl<'a> Status<'a> {
         self.latency
     }
 
-    /// Times the gateway itself slept; see [`super::Engine::sleeps`].
+    /// How often the gateway itself slept; see [`super::Engine::sleeps`].
     pub fn sleeps(&self) -> u32 {
         self.sleeps
     }
@@ -305,7 +304,7 @@ impl<'a> Status<'a> {
         self.ports.get(usize::from(port)).map(|port| port.name.as_str())
     }
 
-    /// Whether a field of the frame writes this variable, which has left it because the field was rejected.
+    /// Whether a field of the frame writes this variable, which left the frame because the field was rejected.
     fn has_field(&self, frame: &InputFrame, var: SysVar) -> bool {
         if !self.image.withheld().contains(var) {
             return false;
@@ -325,7 +324,7 @@ impl<'a> Status<'a> {
         }
     }
 
-    /// The field that a rejection of this port was.
+    /// The rejected field of a port's rejection, if it was one.
     fn rejected(&self, port: usize, last: &LastRejection) -> Option<RejectedField> {
         let rejected = last.field?;
         let own = self.frames.iter().filter(|frame| usize::from(frame.port) == port);

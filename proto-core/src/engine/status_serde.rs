@@ -43,7 +43,7 @@ impl<K: Serialize, V: Serialize, I: Iterator<Item = (K, V)>, F: Fn() -> I> Seria
     }
 }
 
-/// A value as the text that it displays.
+/// A value as its displayed text.
 struct AsText<T>(T);
 
 impl<T: fmt::Display> Serialize for AsText<T> {
@@ -65,8 +65,8 @@ impl fmt::Display for Hex<'_> {
     }
 }
 
-/// A number of a field: a whole one as such, another one in 32 bits, which a board writes without the much longer code
-/// for all 64.
+/// A field's number: whole numbers as integers, others in 32 bits, because the code for 64 bits is much longer on a
+/// board.
 struct Number(f64);
 
 impl Serialize for Number {
@@ -102,7 +102,7 @@ impl Serialize for Field {
     }
 }
 
-/// A rejection, with the instant of the status.
+/// A rejection and its field, with the instant of the status.
 struct Rejected<'a>(&'a LastRejection, Option<RejectedField>, Instant);
 
 impl Serialize for Rejected<'_> {

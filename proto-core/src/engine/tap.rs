@@ -1,15 +1,14 @@
 //! A tap on ports and links, for a trace, a capture or a page.
 //!
-//! In: frames and bytes, and whether they were accepted. Out: records, in order. The ring is
-//! bounded and lossy: records without room are counted, and the engine never waits for a reader.
-//! While it does not listen, it costs one branch.
+//! In: frames and bytes, and whether they were accepted. Out: records, in order. The ring is bounded and lossy: records
+//! that do not fit are counted, and the engine never waits for a reader. A tap that does not listen costs one branch.
 
 use super::io::{LinkId, PortId};
 use super::rejection::Rejection;
 use crate::time::Instant;
 use crate::wire::can::CanId;
 
-/// Maximum number of bytes in a record; of longer data the first are kept.
+/// Maximum number of bytes in a record; longer data is cut off.
 pub const MAX_TAPPED: usize = 1536;
 
 /// The place of a record.
@@ -39,13 +38,13 @@ pub enum TapDirection {
 pub enum TapVerdict {
     /// A whole frame or datagram was accepted, or bytes were handed over for sending.
     Taken,
-    /// Bytes or a datagram of a link, as received; answers, packets and frames are found in them.
+    /// Bytes or a datagram of a link, as received; replies, packets and frames are found in them later.
     Link,
     /// It was rejected as a whole.
     Rejected(Rejection),
 }
 
-/// One record: data that went over a port or link.
+/// One record: data that passed over a port or link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TapRecord<'a> {
     /// When it was reported to the engine, or handed over.
@@ -58,7 +57,7 @@ pub struct TapRecord<'a> {
     pub verdict: TapVerdict,
     /// The frame's id on a CAN bus.
     pub can_id: Option<CanId>,
-    /// Length in bytes; more than in `bytes` if that was cut to [`MAX_TAPPED`].
+    /// Length in bytes; greater than that of `bytes` if the data was cut to [`MAX_TAPPED`].
     pub len: usize,
     /// The bytes.
     pub bytes: &'a [u8],
@@ -66,14 +65,14 @@ pub struct TapRecord<'a> {
     pub lost: u32,
 }
 
-/// The ring. `Tap<[u8; N]>` has `N` bytes; each record takes its contents and [`TAP_OVERHEAD`] bytes.
-/// Without room for one record it never listens.
+/// The ring. `Tap<[u8; N]>` has `N` bytes; each record takes its contents and [`TAP_OVERHEAD`] bytes. A ring too small
+/// for one record never listens.
 #[derive(Debug, Clone)]
 pub struct Tap<R: ?Sized = [u8]> {
     is_listening: bool,
-    /// Number of records lost since the newest that was kept.
+    /// Number of records lost since the newest kept one.
     lost: u32,
-    /// The beginning of the oldest record.
+    /// Where the oldest record begins.
     start: usize,
     /// Bytes in use.
     used: usize,
@@ -83,7 +82,7 @@ pub struct Tap<R: ?Sized = [u8]> {
 /// Number of bytes that a record takes in addition to its contents.
 pub const TAP_OVERHEAD: usize = 23;
 
-/// What the engine reports to the tap.
+/// Data for a record.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Tapped<'a> {
     pub at: Instant,
@@ -91,12 +90,12 @@ pub(super) struct Tapped<'a> {
     pub direction: TapDirection,
     pub verdict: TapVerdict,
     pub can_id: Option<CanId>,
-    /// The bytes, in pieces: head, payload and tail of a frame.
+    /// Head, payload and tail of a frame, or all bytes in one piece.
     pub pieces: [&'a [u8]; 3],
 }
 
 impl<const N: usize> Tap<[u8; N]> {
-    /// An empty ring that does not listen. All its bytes are 0.
+    /// An empty ring that does not listen; all bytes are 0.
     pub(super) const fn new() -> Self {
         Self { is_listening: false, lost: 0, start: 0, used: 0, ring: [0; N] }
     }
@@ -117,13 +116,13 @@ impl Tap {
         }
     }
 
-    /// Data is handed over for sending.
+    /// Records data handed over for sending.
     pub(super) fn went(&mut self, place: TapPlace, can_id: Option<CanId>, bytes: &[u8], at: Instant) {
         let (direction, verdict) = (TapDirection::Out, TapVerdict::Taken);
         self.record(|| Tapped { at, place, direction, verdict, can_id, pieces: [bytes, &[], &[]] });
     }
 
-    /// Bytes, or a datagram, came on a link.
+    /// Records bytes, or a datagram, received on a link.
     pub(super) fn came(&mut self, link: LinkId, bytes: &[u8], at: Instant) {
         let (place, direction, verdict) = (TapPlace::Link(link), TapDirection::In, TapVerdict::Link);
         self.record(|| Tapped { at, place, direction, verdict, can_id: None, pieces: [bytes, &[], &[]] });
@@ -135,9 +134,8 @@ impl Tap {
         (self.lost, self.start, self.used) = (0, 0, 0);
     }
 
-    /// Removes and returns the oldest record. Its bytes are written to `room`, which should have
-    /// [`MAX_TAPPED`] bytes: of a longer record the first are returned. `None` if there is no
-    /// record.
+    /// Removes and returns the oldest record; `None` if there is none. Its bytes are written to `room`, which should
+    /// have [`MAX_TAPPED`] bytes: a longer record is cut off.
     pub fn next<'b>(&mut self, room: &'b mut [u8]) -> Option<TapRecord<'b>> {
         if self.used < TAP_OVERHEAD {
             return None;
@@ -211,7 +209,7 @@ impl Tap {
         }
     }
 
-    /// Appends bytes; there is room.
+    /// Appends bytes; the caller has checked that they fit.
     fn push(&mut self, bytes: &[u8]) {
         let end = wrapped(self.start.saturating_add(self.used), self.ring.len());
         let (before, behind) = self.ring.split_at_mut_checked(end).unwrap_or((&mut [], &mut []));
@@ -221,7 +219,7 @@ impl Tap {
         self.used = self.used.saturating_add(bytes.len());
     }
 
-    /// Removes the first bytes; they exist.
+    /// Removes the first bytes; the caller has checked that they exist.
     fn pull(&mut self, into: &mut [u8]) {
         let (before, behind) = self.ring.split_at_checked(self.start).unwrap_or((&[], &[]));
         for (place, &byte) in into.iter_mut().zip(behind.iter().chain(before)) {
@@ -242,7 +240,7 @@ impl Tap {
     }
 }
 
-/// A place in the ring; `at` is less than twice its size.
+/// A position in the ring; `at` is less than twice its size.
 fn wrapped(at: usize, size: usize) -> usize {
     at.checked_sub(size).unwrap_or(at)
 }

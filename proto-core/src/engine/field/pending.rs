@@ -18,13 +18,13 @@ use crate::time::Instant;
 pub(crate) enum Heard<'i> {
     /// The echo of the gateway's request.
     Echo,
-    /// The expected reply, with the format of its data.
+    /// The expected reply, with the format of its data if it has any.
     Reply(Option<&'i InputFormat>),
     /// The expected reply, or the echo of the gateway's request.
     ReplyOrEcho,
     /// The device is still processing the request; its reply follows.
     Pending(&'i OtherFormat),
-    /// The device refuses the request, perhaps with a frame that has values.
+    /// The device refuses the request; with the format of its frame, except on Modbus.
     Refusal(Option<&'i OtherFormat>),
     /// A reply to an earlier request of this exchange that arrived too late, or its pending answer.
     Late { exchange: u8, is_pending: bool },

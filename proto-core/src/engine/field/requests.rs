@@ -1,7 +1,7 @@
 //! The requests of exchanges: which is next, and its bytes.
 //!
 //! In: the image, the exchanges of a port, its line. Out: a request, unless one of its values is unknown or stale. The
-//! request of an event was already made when it happened. Does not know replies.
+//! request of an event was already made when it happened.
 
 use core::num::NonZero;
 

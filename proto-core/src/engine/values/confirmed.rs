@@ -129,7 +129,7 @@ impl Store {
         self.again(&safe);
     }
 
-    /// Whether a value that the controller shows now can be no older than the safe values.
+    /// Whether a value that the controller shows now is new enough to confirm safe values.
     pub(crate) fn may_confirm(&self) -> bool {
         !self.unconfirmed.is_empty() && self.now >= self.unconfirmed_since + SHOWN_AFTER
     }
