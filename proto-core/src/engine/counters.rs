@@ -16,7 +16,8 @@ pub struct PortCounters {
     pub bytes_out: u32,
     /// Frames rejected because a value is not finite (D22); for device frames, those of which no value was taken.
     pub rejected_not_finite: u32,
-    /// Likewise, because a bound value did not fit its variable (D22).
+    /// Frames rejected because a bound value did not fit its variable (D22); for device frames, those of which no value
+    /// was taken.
     pub rejected_out_of_range: u32,
     /// CAN frames ignored because the recipe does not have their id (D17).
     pub rejected_id: u32,
@@ -26,7 +27,8 @@ pub struct PortCounters {
     pub rejected_remote: u32,
     /// Frames rejected because their checksum is wrong.
     pub rejected_checksum: u32,
-    /// Likewise, because a field is not a number, such as a letter among digits.
+    /// Frames rejected because a field is not a number, such as a letter among digits; for device frames, those of which
+    /// no value was taken.
     pub rejected_unreadable: u32,
     /// Valid frames of another device: a constant differs.
     pub rejected_other_device: u32,

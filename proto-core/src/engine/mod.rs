@@ -125,8 +125,7 @@ pub struct Engine<
 impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: usize, const EXCHANGES: usize>
     Engine<PORTS, UPLINKS, FIELDS, TAP, EXCHANGES>
 {
-    /// Maximum number of links of this engine: port 2000 twice, port 2001, Modbus, and the recipe
-    /// links.
+    /// Maximum number of links of this engine: port 2000 twice, port 2001, Modbus, and the recipe links.
     pub const MAX_LINKS: usize = UPLINKS.saturating_add(4);
 
     /// An engine without a configuration: no ports, no links, nothing to do.
@@ -372,16 +371,16 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         self.clock.sleeps
     }
 
-    /// Prepares to end the engine: at the next [`Input::Tick`] every input frame becomes overdue, as if all devices
-    /// were silent. Waiting values are dropped and safe values are sent; a port that is never overdue keeps its values.
-    /// The driver reports no more input from its ports, and ends the engine when [`Self::is_safe`] returns true or
-    /// after some time.
+    /// Prepares to end the engine: at the next [`Input::Tick`] every input frame that is not overdue yet becomes so, as if
+    /// all devices were silent. Waiting values are dropped and safe values are sent; a port that is never overdue keeps
+    /// its values. The driver reports no more input from its ports, and ends the engine when [`Self::is_safe`] returns
+    /// true or after some time.
     pub fn make_safe(&mut self) {
         self.view().make_safe();
     }
 
-    /// Whether the controller is known to have every safe value that was sent to it. Never true for a value that
-    /// nothing shows.
+    /// Whether the controller is known to have every safe value that was sent to it. A value that nothing shows
+    /// is never known to have arrived.
     pub fn is_safe(&self) -> bool {
         let store: &Store = &self.store;
         store.is_safe()

@@ -80,7 +80,6 @@ impl Serialize for Number {
     }
 }
 
-/// A rejected field.
 struct Field(RejectedField);
 
 impl Serialize for Field {

@@ -129,7 +129,7 @@ impl EngineView<'_> {
                 [(to.to, state.outcome as u16), (to.code_to, state.code), (to.count_to, state.ended)];
             for (var, value) in values {
                 let Some(var) = var else { continue };
-                // The value has the variable's type.
+                // Cannot fail: the value has the variable's type.
                 let _ = self.store.image.set(var, wrapping_count(var.ty(), value.into()));
                 told.insert(var);
             }

@@ -49,14 +49,12 @@ pub(crate) struct Trigger {
     pub last: Option<Reading>,
 }
 
-/// A reading of a bit.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Reading {
     pub on: bool,
     pub at: Instant,
 }
 
-/// The event of an exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Event {
     /// No event is open.

@@ -50,7 +50,6 @@ pub(crate) struct ExchangeItem {
     pub on_change: bool,
     /// The bit whose rise sends it.
     pub trigger: Option<Trigger>,
-    /// It stops its peer.
     pub stops: bool,
     /// The exchange of the port that it follows once that is done.
     pub follow: Option<u8>,

@@ -24,7 +24,6 @@ pub(crate) struct Accepted {
     pub set: InputSet,
 }
 
-/// The context for applying a frame.
 pub(crate) struct FrameContext<'a> {
     pub mode: Mode,
     pub bindings: &'a [InputBind],

@@ -161,7 +161,6 @@ impl Flight {
 }
 
 impl ExchangeTable<'_> {
-    /// The peer of a request.
     pub(crate) fn peer_of(&mut self, flight: Flight) -> Option<&mut PeerState> {
         let peer = self.rows.get(usize::from(flight.exchange)).map_or(0, |row| row.peer);
         self.peers.get_mut(usize::from(peer))
@@ -206,7 +205,6 @@ impl Line {
         matches!(self.phase, Phase::Idle | Phase::Repeat(_))
     }
 
-    /// The request in flight.
     pub(crate) const fn flight(&self) -> Option<Flight> {
         match self.phase {
             Phase::Sending(flight) | Phase::Waiting(flight) => Some(flight),
@@ -363,7 +361,7 @@ impl Line {
         now: Instant,
     ) -> (Ended, News) {
         let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
-        // The reply may be a late one to the first transmission, so that to the repetition may still come.
+        // The reply may be a late one to the first transmission; that to the repetition is still to come then.
         let sent = if matches!(self.phase, Phase::Sending(_)) { now } else { self.sent };
         if let Some(row) = table.row_of(flight).filter(|row| flight.is_ambiguous || row.is_outstanding(now)) {
             // It may be the reply to another exchange, or to an earlier transmission of a stop; its own is still to
@@ -525,7 +523,6 @@ impl Line {
         self.has_echo = self.echo_setting.known();
     }
 
-    /// When something is due without an input.
     pub(crate) fn deadline(&self, line: &LineTiming) -> Instant {
         let looks = self.looks.as_ref().map_or(Instant::NEVER, Grid::next);
         let next = match self.phase {

@@ -5,7 +5,6 @@
 use crate::config::Rs485;
 use crate::time::{Duration, Instant};
 
-/// Timing of a half-duplex line.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LineTiming {
     pub idle_gap: Duration,

@@ -14,7 +14,6 @@ const KEPT: usize = 4;
 /// Marks an answered request. No exchange has this index: a port has fewer.
 const ANSWERED: u8 = u8::MAX;
 
-/// The transactions of one port.
 #[derive(Debug, Clone)]
 pub(crate) struct Transactions {
     /// The id of the newest request. It continues over reconnects, and wraps.

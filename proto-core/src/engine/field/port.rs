@@ -49,7 +49,6 @@ pub(crate) struct FieldPort {
 }
 
 impl FieldPort {
-    /// The device is up.
     pub(crate) fn up(&mut self) {
         self.is_up = true;
     }
@@ -303,8 +302,8 @@ impl FieldPort {
         self.partial_until().min(self.send_deadline())
     }
 
-    /// The deadline if input has begun a frame or made one due; others are unchanged then. Also flags a port that may
-    /// have an output.
+    /// The deadline after input that has begun a frame or made one due; `None` if it cannot have become earlier. Also
+    /// flags a port that may have an output.
     pub(crate) fn deadline_of_heard(&self, ask: &mut Dirty) -> Option<Instant> {
         let is_due = self.sender.is_due();
         ask.add(Dirty::PORTS.when(is_due));

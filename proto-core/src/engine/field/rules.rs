@@ -112,7 +112,6 @@ pub(crate) fn allowed(binding: &InputBind, all: &[InputBind]) -> (Option<SysVar>
     }
 }
 
-/// The rules of one field.
 #[derive(Clone, Copy)]
 pub(crate) struct Rules<'a> {
     words: &'a [InputBind],

@@ -99,7 +99,6 @@ impl Sender {
         self.due && !self.in_flight
     }
 
-    /// Whether only changes are sent.
     pub(crate) fn sends_changes(&self) -> bool {
         self.on == SendOn::Change
     }

@@ -26,7 +26,6 @@ use crate::time::Instant;
 /// Data of the longest block.
 const MAX_DATA: usize = 256;
 
-/// The blocks of a slave.
 struct Blocks<'a> {
     items: &'a mut [ExchangeItem],
     written: &'a mut [Piece],
@@ -81,7 +80,7 @@ impl Blocks<'_> {
             let data = self.data(item, &mut buffer)?;
             let behind = usize::from(at.saturating_sub(first)).saturating_mul(2);
             let (pairs, _) = data.get(behind..).unwrap_or(&[]).as_chunks::<2>();
-            // Pairs before words: `zip` would drop a word when the block ends.
+            // Pairs before words, so that `zip` drops no word when the block ends.
             for (pair, word) in pairs.iter().zip(&mut words) {
                 *word = *pair;
                 at = at.wrapping_add(1);

@@ -81,7 +81,6 @@ pub(crate) struct Row {
     pub is_unconfirmed: bool,
 }
 
-/// The kind of an exchange.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RowKind {
     /// Whether it has a reply, which shows that the peer is up.
@@ -90,13 +89,11 @@ pub(crate) struct RowKind {
     pub starts: bool,
     /// It is also sent for other reasons, so the start is not separate.
     pub is_state: bool,
-    /// It stops its peer.
     pub stops: bool,
     /// Maximum number of repetitions, of a state and of an event.
     pub retries: [u8; 2],
 }
 
-/// The times of a row.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Times {
     /// Time it takes on the line without a reply.
@@ -170,7 +167,6 @@ pub(crate) enum Cause {
 /// How a request ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ended {
-    /// A good reply came.
     Good,
     /// The peer refused it for good.
     Refused,
@@ -422,7 +418,6 @@ impl Turns<'_> {
         }
     }
 
-    /// The line begins anew.
     pub(crate) fn begin(&mut self, now: Instant) {
         self.rows.iter_mut().for_each(|row| row.begin(now));
         self.peers.iter_mut().for_each(|peer| peer.forget());

@@ -93,7 +93,7 @@ impl CommandLink {
         self.text(entry, value)
     }
 
-    /// The newest text on a connection that was not the reply to a command.
+    /// The newest text on a connection that was not recognized as a reply.
     pub(crate) fn other_text_of<'a>(&'a self, session: &'a Session) -> Option<OtherText<'a>> {
         let last = session.last_text.as_ref()?;
         let command = last.entry.and_then(|entry| self.text(entry, last.value));
@@ -260,7 +260,6 @@ impl CommandLink {
         }
     }
 
-    /// A connection came up.
     pub(crate) fn up(&mut self, link: LinkId, now: Instant) {
         if let Some(session) = self.session(link) {
             session.supervisor.up(now);
@@ -359,14 +358,12 @@ impl CommandLink {
         }
     }
 
-    /// The transport has taken everything.
     pub(crate) fn sent(&mut self, link: LinkId) {
         if let Some(session) = self.session(link) {
             session.taken();
         }
     }
 
-    /// The peer's transport has acknowledged all but `left` bytes.
     pub(crate) fn acked(&mut self, link: LinkId, left: u32) {
         if let Some(session) = self.session(link) {
             session.acked(left);

@@ -62,7 +62,6 @@ pub(crate) enum Picked {
     },
 }
 
-/// All command tables.
 #[derive(Debug, Clone)]
 pub(crate) struct Tables {
     entries: Vec<Entry, MAX_COMMANDS>,
@@ -70,7 +69,6 @@ pub(crate) struct Tables {
     texts: String<MAX_COMMAND_BYTES>,
 }
 
-/// One entry of a command table.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Entry {
     first: i64,
@@ -98,7 +96,6 @@ impl Tables {
         Some(tables)
     }
 
-    /// An entry and its text.
     pub(crate) fn entry(&self, entry: u16) -> Option<(Entry, &str)> {
         let entry = self.entries.get(usize::from(entry))?;
         let start = usize::from(entry.start);
@@ -117,7 +114,6 @@ impl Tables {
         table.of(&self.entries).iter().any(|entry| entry.len == 0)
     }
 
-    /// Whether one of the commands is urgent.
     pub(crate) fn has_urgent(&self) -> bool {
         self.entries.iter().any(|entry| entry.keyword.is_urgent())
     }

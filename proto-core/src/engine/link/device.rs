@@ -74,7 +74,6 @@ impl DeviceLink {
         }
     }
 
-    /// When something is due without an input.
     pub(crate) fn deadline(&self) -> Instant {
         self.supervisor.deadline().min(self.due_at)
     }

@@ -38,7 +38,7 @@ pub struct LinkInfo<'a> {
     pub history: &'a LinkHistory,
     /// Its counters.
     pub counters: &'a LinkCounters,
-    /// For a connection to port 2000: the newest text that was not the reply to a command.
+    /// For a connection to port 2000: the newest text that was not recognized as a reply.
     pub other_text: Option<OtherText<'a>>,
     /// The instant of the snapshot, for ages; zero outside a [`crate::engine::Status`].
     #[cfg(feature = "serde")]
@@ -118,7 +118,6 @@ impl<'a> LinksView<'a> {
         }
     }
 
-    /// Whether a link is up.
     pub(crate) fn is_up(self, id: LinkId) -> bool {
         let supervisor = match id {
             LinkId::COMMAND => self.command.map(|link| &link.ordinary.supervisor),
@@ -133,7 +132,6 @@ impl<'a> LinksView<'a> {
         supervisor.is_some_and(Supervisor::is_up)
     }
 
-    /// When something is due without an input.
     pub(crate) fn deadline(self) -> Instant {
         let mut first = self.deadline_of(LinkId::COMMAND);
         first = first.min(self.deadline_of(LinkId::STATE)).min(self.deadline_of(LinkId::MODBUS));
@@ -356,7 +354,6 @@ impl Links<'_> {
         deadline.unwrap_or(Instant::NEVER)
     }
 
-    /// The peer's transport has acknowledged all but `left` bytes.
     pub(crate) fn acked(&mut self, id: LinkId, left: u32, store: &mut Store) {
         if let LinkId::COMMAND | LinkId::URGENT = id {
             self.command.iter_mut().for_each(|link| link.acked(id, left));

@@ -1,4 +1,4 @@
-//! Texts on port 2000 that were not the reply to a command: the newest of each connection, for status and statistics
+//! Texts on port 2000 that were not recognized as a reply: the newest of each connection, for status and statistics
 //! (docs/engine.md section 7).
 
 use heapless::String;
@@ -10,7 +10,7 @@ use crate::time::Instant;
 /// Maximum length of a kept text in bytes; the rest is cut off.
 pub const MAX_OTHER_TEXT: usize = 48;
 
-/// A text that was not the reply to a command, and the command that it may answer.
+/// A text that was not recognized as a reply, and the command that it may answer.
 #[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub struct OtherText<'a> {

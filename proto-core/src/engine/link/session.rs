@@ -40,7 +40,7 @@ pub(crate) struct Session {
     /// The command whose reply is pending; `beside`: a newer, urgent one that did not wait for it.
     pub in_flight: Option<Sent>,
     pub beside: Option<Sent>,
-    /// The newest text that was not the reply to a command.
+    /// The newest text that was not recognized as a reply.
     pub last_text: Option<LastText>,
     /// The transport has not taken the newest command yet.
     unsent: bool,

@@ -108,7 +108,7 @@ impl EngineView<'_> {
                     FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => *to,
                     _ if field.element().is_some() => InputBinding::Unused,
                     _ => {
-                        // The rules of a field, including its scale.
+                        // The rules of a field.
                         inputs = inputs.saturating_add(words_of(field).count());
                         continue;
                     }

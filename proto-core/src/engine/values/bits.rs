@@ -149,7 +149,6 @@ impl Bits {
         Some(())
     }
 
-    /// The shares, for a status.
     pub(crate) fn shares(&self) -> &[Share] {
         &self.shares
     }
@@ -350,7 +349,6 @@ impl Bits {
         (dropped, oldest)
     }
 
-    /// The link of these bytes came up.
     pub(crate) fn link_up(&mut self, bytes: &InputSet) {
         self.reachable = self.reachable.or(BitSet::all_of(bytes));
     }

@@ -57,8 +57,8 @@ pub(crate) struct Store<Q: ?Sized = VecView<EdgeQueue>> {
     pub counts: Counts,
     /// The instant of the current call of the engine.
     pub now: Instant,
-    /// Some port sends on a rising bit, or shows the health of ports in replies, so the image is checked after each
-    /// frame, even if several arrive at once.
+    /// Some port sends on a rising bit, or shows the health of ports in frames without a cycle, so the image is checked
+    /// after each frame, even if several arrive at once.
     pub watches_bits: bool,
     pub image: Image,
     pub outbox: Outbox,
@@ -464,7 +464,6 @@ impl Store {
         }
     }
 
-    /// When something is due without an input.
     pub(crate) fn deadline(&self) -> Instant {
         self.next_overdue.get().min(self.next_expiry.get())
     }

@@ -167,7 +167,6 @@ impl Withheld {
     }
 }
 
-/// The variables of a group.
 pub(crate) fn members(image: &Image, group: GroupId) -> InputSet {
     image.withheld().iter().filter(|&var| image.group(var) == Some(group)).collect()
 }
