@@ -135,18 +135,14 @@ impl Dirty {
     pub(super) const NONE: Self = Self(0);
     /// Links that may send; the command link is only checked together with the others.
     pub(super) const LINKS: Self = Self(1 | 16 | 32);
-    /// Recipe links that may send.
     pub(super) const RECIPES: Self = Self(16);
-    /// The Modbus link may send.
     pub(super) const MODBUS: Self = Self(32);
     /// Links that may be opened or closed.
     pub(super) const ACTIONS: Self = Self(2);
-    /// Ports that may send.
     pub(super) const PORTS: Self = Self(4);
     /// The timer is up to date: `timer_at` was computed since the clock was last checked.
     // Inverted, so that an engine without a configuration is all zeros and takes no flash.
     pub(super) const ARMED: Self = Self(8);
-    /// All ports and links.
     pub(super) const ALL: Self = Self(Self::LINKS.0 | 2 | 4);
 
     pub(super) const fn has(self, what: Self) -> bool {

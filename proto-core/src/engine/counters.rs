@@ -146,7 +146,6 @@ impl PortCounters {
 }
 
 impl LinkCounters {
-    /// All zero.
     pub(super) const ZERO: Self = Self {
         sent: 0,
         received: 0,

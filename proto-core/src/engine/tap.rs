@@ -74,7 +74,6 @@ pub struct Tap<R: ?Sized = [u8]> {
     lost: u32,
     /// Where the oldest record begins.
     start: usize,
-    /// Bytes in use.
     used: usize,
     ring: R,
 }
@@ -109,7 +108,6 @@ impl<R: ?Sized> Tap<R> {
 }
 
 impl Tap {
-    /// Keeps a record if the tap listens.
     pub(super) fn record<'a>(&mut self, what: impl FnOnce() -> Tapped<'a>) {
         if self.is_listening {
             self.keep(&what());

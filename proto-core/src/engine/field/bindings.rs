@@ -123,7 +123,6 @@ impl Rule {
         f64::from_bits(self.bits())
     }
 
-    /// The two halves of the bits.
     pub(crate) const fn halves(self) -> [u32; 2] {
         [self.bits().unbounded_shr(32) as u32, self.bits() as u32]
     }
@@ -231,7 +230,6 @@ pub(crate) struct OutputBind {
     pub written: Written,
 }
 
-/// What a field may send.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Sendable {
     Limits(Limits),
@@ -301,7 +299,6 @@ impl OutputBind {
     }
 }
 
-/// The values of the fields.
 pub(crate) fn values(
     bindings: &[OutputBind],
     image: &Image,
@@ -382,7 +379,6 @@ fn counted_to(count: u32, max: u32) -> u32 {
 pub(crate) struct Bindings<'e> {
     pub inputs: &'e mut VecView<InputBind>,
     pub outputs: &'e mut VecView<OutputBind>,
-    /// What output fields may send.
     pub sendable: &'e mut Vec<Sendable, MAX_SENDABLE>,
 }
 

@@ -18,7 +18,6 @@ use crate::image::bind_to_variable;
 use crate::sysvar::SysVar;
 use crate::wire::scalar::Scalar;
 
-/// The verdict on a field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Verdict {
     /// It is a field without a value, such as padding.

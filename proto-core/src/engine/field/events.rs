@@ -28,7 +28,6 @@ pub(crate) struct Sources<C> {
     pub is_usable: bool,
 }
 
-/// The events of one line.
 pub(crate) struct Events<'a, 't> {
     pub items: &'a mut [ExchangeItem],
     pub table: &'a mut ExchangeTable<'t>,

@@ -9,7 +9,6 @@ use crate::device::{Element, FrameLayout, Probe};
 use crate::engine::rejection::Rejection;
 use crate::wire::can::{CanFrame, CanKey};
 
-/// The format of one device frame.
 #[derive(Debug, Clone)]
 pub(crate) struct DeviceFormat {
     pub layout: FrameLayout,

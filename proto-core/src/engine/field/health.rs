@@ -18,7 +18,6 @@ pub(crate) const CHECK_EVERY: Duration = Duration::from_millis(100);
 /// have undone them.
 pub(crate) const REPEAT_EVERY: Duration = Duration::from_secs(1);
 
-/// Every value of every port.
 const MOST: usize = MAX_PORTS * PortValue::NAMES.len();
 
 /// A value of health that an output field shows.

@@ -81,7 +81,7 @@ pub(crate) enum Over {
     Unconfirmed,
 }
 
-/// The exchanges of one port.
+/// The state of one port's exchanges.
 #[derive(Debug, Clone)]
 pub(crate) struct Line {
     /// The port's ranges of the exchanges and of the peers.

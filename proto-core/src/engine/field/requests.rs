@@ -139,7 +139,6 @@ impl Maker<'_> {
         item.request.as_ref().map_or(&[], |format| format.bindings.of(self.bindings.binds))
     }
 
-    /// The groups of the variables in the request.
     pub(crate) fn groups_of(&self, item: &ExchangeItem) -> impl Iterator<Item = GroupId> {
         self.fields(item).iter().filter_map(|field| match field.from {
             OutputBinding::Variable { var, .. } | OutputBinding::Bit { var, .. } => self.image.group(var),

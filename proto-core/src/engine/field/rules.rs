@@ -17,7 +17,6 @@ use crate::image::{bind_to_variable, round};
 use crate::sysvar::SysVar;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// The words of the rules of a field.
 pub(crate) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + use<> {
     let mut words = [None; 3];
     let number = |is, number: f64| Some(Rule::new(is, number.to_bits()));

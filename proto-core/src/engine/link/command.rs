@@ -100,7 +100,6 @@ impl CommandLink {
         Some(OtherText { at: last.at, text: &last.text, command })
     }
 
-    /// The text that a value picked.
     pub(crate) fn text(&self, entry: u16, value: i64) -> Option<CommandText<'_>> {
         self.tables.entry(entry).map(|(_, text)| CommandText { text, value })
     }
@@ -203,7 +202,6 @@ impl CommandLink {
         }
     }
 
-    /// Drops a command that waited.
     fn drop_command(&mut self, command: Waiting, why: DropReason, now: Instant) {
         self.tell(command.port, why, (command.field, command.value), now);
         self.outcomes.push(command, ReplyCode::NotSent);

@@ -79,7 +79,6 @@ macro_rules! each_connection {
 
 /// The links that the configuration needs.
 pub(crate) struct Links<'e> {
-    /// The controller's address or name.
     pub host: &'e mut String<MAX_HOST>,
     pub command: &'e mut Maybe<CommandLink>,
     pub state: &'e mut Maybe<StateLink>,

@@ -64,7 +64,6 @@ enum Asked {
 #[derive(Debug, Clone, Copy)]
 struct InFlight {
     asked: Asked,
-    /// When it is given up.
     until: Instant,
 }
 
@@ -119,7 +118,6 @@ pub(crate) struct ModbusLink {
 }
 
 impl ModbusLink {
-    /// Whether it polls the variables of a group.
     pub(crate) fn polls(&self, group: GroupId) -> bool {
         self.blocks.iter().any(|block| block.group == group)
     }

@@ -6,7 +6,6 @@ use heapless::Vec;
 use super::stops::{COMMAND_QUEUE, MAX_STOPS, Waiting};
 use crate::engine::io::{PortId, ReplyCode};
 
-/// The result of one command.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Outcome {
     pub port: PortId,

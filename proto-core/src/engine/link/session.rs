@@ -22,7 +22,6 @@ pub(crate) struct Sent {
     pub has_text: bool,
 }
 
-/// An event on a connection.
 pub(crate) enum Event {
     /// A command has its result.
     Answered(Sent, ReplyCode),

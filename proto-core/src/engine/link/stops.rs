@@ -72,7 +72,6 @@ impl Stops {
         }
     }
 
-    /// The kinds that wait.
     pub(crate) fn kinds(&self) -> impl Iterator<Item = Keyword> + '_ {
         self.0.iter().map(|(keyword, _)| *keyword)
     }

@@ -278,7 +278,6 @@ mod tests {
             self.outbox.offer_bits(&mut self.queue, &mut self.counters, var, value, self.now);
         }
 
-        /// All values that are written, in order.
         fn drain(&mut self, var: SysVar) -> std::vec::Vec<u8> {
             let mut written = std::vec::Vec::new();
             while self.outbox.dirty().contains(var) {

@@ -38,7 +38,6 @@ impl InputFrame {
     }
 }
 
-/// What is overdue.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Overdue {
     /// A frame, and how many waiting values were dropped.

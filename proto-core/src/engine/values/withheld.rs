@@ -85,7 +85,6 @@ impl Withheld {
         waiting.for_each(|at| *at = Stamp::at(Instant::ZERO));
     }
 
-    /// The groups, each with its frame.
     pub(crate) fn groups(&self) -> impl Iterator<Item = (GroupId, u8)> + use<> {
         (0..).map(group_of).zip(self.frames)
     }
