@@ -232,7 +232,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// Inputs for a port or link that the configuration does not have are ignored.
     ///
     /// [`Handled::Asleep`] spares a driver the call of [`Self::poll_output`]; it may be ignored.
-    // A frame byte by byte to UDP takes 4923 instructions with this out of line, 4282 with it inline.
+    // A frame byte by byte to UDP takes 4923 instructions with this out of line, 4130 with it inline.
     #[inline(always)]
     pub fn handle(&mut self, now: Instant, input: Input<'_>) -> Handled {
         let handled = match input {

@@ -190,8 +190,6 @@ impl CanLayout {
 
     /// The index of the frame with this id. At least half of the places are empty, so the search is
     /// short.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
-    #[inline]
     fn index_of(&self, key: CanKey) -> Option<usize> {
         let first = self.search_order(key).next()?;
         let index = usize::from(*self.places.get(first)?);
@@ -252,7 +250,6 @@ impl<'a> CanFrameLayout<'a> {
     ///
     /// # Errors
     /// [`ValueError`]: a float that is not finite, or data of another length.
-    #[inline]
     pub fn apply(&self, data: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
         if data.len() == self.len()
             && let Some(applied) = self.share.whole.apply(data, image)

@@ -38,8 +38,6 @@ impl EngineView<'_> {
     }
 
     /// Takes bytes; false if the port's recipe has no exchanges.
-    // The cost is in docs/performance.md section 1, like that of the other attributes here.
-    #[cold]
     pub(crate) fn exchange_bytes(&mut self, id: PortId, bytes: &[u8], now: Instant) -> bool {
         let Some(port) = find_port(self.ports, id) else { return false };
         if port.line().is_none() {

@@ -372,7 +372,6 @@ impl FieldPort {
 
     /// `skipped` bytes of a chunk, or of bytes held before it, belong to no frame. Without silence between them,
     /// further ones extend the same rejection.
-    #[cold]
     pub(crate) fn no_frame(&mut self, bytes: &[u8], skipped: usize, tap: &mut Tap, now: Instant) {
         tap.record(|| came(self.id, now, Err(Rejection::NoFrame), None, [bytes, &[], &[]]));
         match &mut self.last_rejection {
