@@ -61,7 +61,7 @@ use link::command::CommandLink;
 use link::device::DeviceLink;
 use link::links::{Links, LinksView, MAX_HOST, Maybe};
 use link::modbus::ModbusLink;
-use link::recipe::Uplink;
+use link::recipe::RecipeLink;
 use link::state::StateLink;
 use values::bits::SafeBytes;
 use values::outbox::EdgeQueue;
@@ -105,7 +105,7 @@ pub struct Engine<
     command: Maybe<CommandLink>,
     state: Maybe<StateLink>,
     modbus: Maybe<ModbusLink>,
-    recipes: Vec<Uplink, UPLINKS>,
+    recipes: Vec<RecipeLink, UPLINKS>,
     /// Connections to devices; at most as many as recipe links.
     devices: Vec<DeviceLink, UPLINKS>,
     store: Store<Vec<EdgeQueue, PORTS>>,
@@ -238,14 +238,14 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         let handled = match input {
             _ if !self.clock.is_idle(now) => None,
             Input::PortBytes { port, bytes } => hold(&mut self.clock, &mut self.ports, port, bytes, now),
-            _ => self.handle_idle(now, &input),
+            _ => self.handle_fast(now, &input),
         };
-        handled.unwrap_or_else(|| self.handle_awake(now, &input))
+        handled.unwrap_or_else(|| self.handle_full(now, &input))
     }
 
     // Out of line to keep the view off the stack of the fast path.
     #[inline(never)]
-    fn handle_awake(&mut self, now: Instant, input: &Input<'_>) -> Handled {
+    fn handle_full(&mut self, now: Instant, input: &Input<'_>) -> Handled {
         self.view().handle(now, input)
     }
 
@@ -254,7 +254,7 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
     /// nothing else to send yet. `None` if the input has to be handled; nothing has changed then.
     // Saves 230 of 1360 instructions for a frame to UDP.
     #[inline(never)]
-    fn handle_idle(&mut self, now: Instant, input: &Input<'_>) -> Option<Handled> {
+    fn handle_fast(&mut self, now: Instant, input: &Input<'_>) -> Option<Handled> {
         let mut handled = Handled::Asleep;
         match *input {
             Input::PortCan { port, ref frame } if !self.tap.is_listening() => {
@@ -305,12 +305,12 @@ impl<const PORTS: usize, const UPLINKS: usize, const FIELDS: usize, const TAP: u
         if self.clock.is_quiet(now) {
             return self.clock.sleep(!self.ports.is_empty());
         }
-        self.poll_awake(now, buf)
+        self.poll_full(now, buf)
     }
 
-    // Out of line for the same reason as `handle_awake`.
+    // Out of line for the same reason as `handle_full`.
     #[inline(never)]
-    fn poll_awake<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
+    fn poll_full<'b>(&mut self, now: Instant, buf: &'b mut [u8; OUTPUT_BUFFER]) -> Output<'b> {
         self.view().poll_work(now, buf)
     }
 

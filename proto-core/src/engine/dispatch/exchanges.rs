@@ -5,7 +5,7 @@ use crate::engine::OUTPUT_BUFFER;
 use crate::engine::clock::Dirty;
 use crate::engine::field::bindings::wrapping_count;
 use crate::engine::field::frames::Accepted;
-use crate::engine::field::output::Downward;
+use crate::engine::field::output::FieldFrame;
 use crate::engine::field::port::{came, find_port, keep_why};
 use crate::engine::io::{LinkId, Output, PortId};
 use crate::engine::tap::TapPlace;
@@ -17,12 +17,12 @@ impl EngineView<'_> {
     /// The output for a request; also records it in the tap.
     pub(crate) fn request_output<'b>(
         &mut self,
-        (port, request): (PortId, Downward),
+        (port, request): (PortId, FieldFrame),
         buf: &'b [u8; OUTPUT_BUFFER],
         now: Instant,
     ) -> Output<'b> {
         match request {
-            Downward::Bytes(len) => {
+            FieldFrame::Bytes(len) => {
                 let bytes = buf.get(..len).unwrap_or(&[]);
                 self.tap.went(TapPlace::Port(port), None, bytes, now);
                 match self.goes_over_link(port, now) {
@@ -30,7 +30,7 @@ impl EngineView<'_> {
                     false => Output::PortSend { port, bytes },
                 }
             }
-            Downward::Can(frame) => {
+            FieldFrame::Can(frame) => {
                 self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
                 Output::PortSendCan { port, frame }
             }
@@ -115,7 +115,7 @@ impl EngineView<'_> {
     }
 
     /// Reports the outcomes of events to the robot: the new ones, or all if `repeats`.
-    pub(crate) fn tell_outcomes(&mut self, repeats: bool) {
+    pub(crate) fn report_outcomes(&mut self, repeats: bool) {
         let mut told = InputSet::EMPTY;
         for item in self.exchanges.items.iter_mut() {
             if !repeats && !item.is_news {
@@ -140,7 +140,7 @@ impl EngineView<'_> {
 
     /// Updates flags and deadlines after a change: the line may be free, or wait for something else.
     fn after_exchange(&mut self, id: PortId) {
-        self.tell_outcomes(false);
+        self.report_outcomes(false);
         self.clock.dirty.add(Dirty::PORTS);
         if let Some(port) = find_port(self.ports, id) {
             port.note_partial();
@@ -217,7 +217,7 @@ impl EngineView<'_> {
     }
 
     /// The next request or reply, of any port.
-    pub(crate) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
+    pub(crate) fn next_request(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, FieldFrame)> {
         if self.clock.has_slept {
             return None;
         }
@@ -230,7 +230,7 @@ impl EngineView<'_> {
             if found.is_none()
                 && let Some(len) = port.next_reply(out, now)
             {
-                found = Some((port.id, Downward::Bytes(len)));
+                found = Some((port.id, FieldFrame::Bytes(len)));
             }
             if found.is_some() || !port.line().is_some_and(|line| line.is_free(now)) {
                 continue;

@@ -51,7 +51,7 @@ impl EngineView<'_> {
     /// them.
     pub(crate) fn check_health(&mut self, now: Instant) {
         if self.health.is_reported && now >= self.health.report_at {
-            self.tell_changes(now);
+            self.report_changes(now);
             self.health.report_at = now + CHECK_EVERY;
         }
         self.show_health(now);
@@ -62,24 +62,24 @@ impl EngineView<'_> {
     }
 
     /// Reports changes to the robot, and everything from time to time.
-    fn tell_changes(&mut self, now: Instant) {
+    fn report_changes(&mut self, now: Instant) {
         let repeats = now >= self.health.repeat_at;
         if repeats {
             self.health.repeat_at = now + REPEAT_EVERY;
         }
-        self.tell_health(|_| true, repeats, now);
+        self.report_health(|_| true, repeats, now);
         if self.exchanges.is_used() {
-            self.tell_outcomes(repeats);
+            self.report_outcomes(repeats);
         }
         self.store.image.stamp(self.health.group, now);
     }
 
     /// Reports at once to the robot whether ports work.
-    pub(crate) fn tell_alive(&mut self, now: Instant) {
-        self.tell_health(|value| value == PortValue::Alive, false, now);
+    pub(crate) fn report_alive(&mut self, now: Instant) {
+        self.report_health(|value| value == PortValue::Alive, false, now);
     }
 
-    fn tell_health(&mut self, is_asked: impl Fn(PortValue) -> bool, repeats: bool, now: Instant) {
+    fn report_health(&mut self, is_asked: impl Fn(PortValue) -> bool, repeats: bool, now: Instant) {
         let mut news = InputSet::EMPTY;
         for nth in 0..self.health.variables.len() {
             let Some(&HealthVariable { port, value, var, last }) = self.health.variables.get(nth) else {

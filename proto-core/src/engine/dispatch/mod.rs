@@ -19,7 +19,7 @@ use crate::engine::field::bindings::Bindings;
 use crate::engine::field::exchanges::Exchanges;
 use crate::engine::field::frames::Accepted;
 use crate::engine::field::health::PortsHealth;
-use crate::engine::field::output::Downward;
+use crate::engine::field::output::FieldFrame;
 use crate::engine::field::port::{FieldPort, find_port};
 use crate::engine::io::{BusState, Handled, Input, Output, PortId};
 use crate::engine::link::links::Links;
@@ -138,8 +138,8 @@ impl EngineView<'_> {
             // A connection may have to be closed before a command can be sent.
             self.clock.dirty.add(Dirty::ACTIONS.when(!self.links.command.is_empty()));
             self.store.now = now;
-            let upward = self.links.next_upward(&mut self.clock.dirty, self.store, &mut buf[..]);
-            self.carry_outcomes();
+            let upward = self.links.next_link_frame(&mut self.clock.dirty, self.store, &mut buf[..]);
+            self.pass_on_outcomes();
             if let Some((link, len, deadline)) = upward {
                 self.arm(deadline);
                 let bytes = buf.get(..len).unwrap_or(&[]);
@@ -162,13 +162,13 @@ impl EngineView<'_> {
             self.clock.dirty.remove(Dirty::ACTIONS);
         }
         if self.clock.dirty.has(Dirty::PORTS) && !self.clock.is_overdue {
-            match self.next_downward(&mut buf[..], now) {
-                Some((port, Downward::Bytes(len))) => {
+            match self.next_field_frame(&mut buf[..], now) {
+                Some((port, FieldFrame::Bytes(len))) => {
                     let bytes = buf.get(..len).unwrap_or(&[]);
                     self.tap.went(TapPlace::Port(port), None, bytes, now);
                     return Output::PortSend { port, bytes };
                 }
-                Some((port, Downward::Can(frame))) => {
+                Some((port, FieldFrame::Can(frame))) => {
                     self.tap.went(TapPlace::Port(port), Some(frame.id()), frame.data(), now);
                     return Output::PortSendCan { port, frame };
                 }
@@ -196,9 +196,9 @@ impl EngineView<'_> {
 
     /// For assertions: whether the ports and links that were not checked really have no output.
     pub(crate) fn all_are_silent(&mut self, out: &mut [u8], now: Instant) -> bool {
-        self.links.next_upward(&mut { Dirty::ALL }, self.store, out).is_none()
+        self.links.next_link_frame(&mut { Dirty::ALL }, self.store, out).is_none()
             && self.links.next_action().is_none()
-            && self.next_downward(out, now).is_none()
+            && self.next_field_frame(out, now).is_none()
             && !(self.exchanges.is_used() && self.next_request(out, now).is_some())
     }
 
@@ -280,7 +280,7 @@ impl EngineView<'_> {
     pub(crate) fn port_up(&mut self, id: PortId) {
         self.change_port(id, FieldPort::up);
         self.exchanges_begin(id);
-        self.tell_alive(self.clock.now);
+        self.report_alive(self.clock.now);
     }
 
     pub(crate) fn port_down(&mut self, id: PortId, now: Instant) {
@@ -288,8 +288,8 @@ impl EngineView<'_> {
         self.clock.dirty.add(Dirty::ALL);
         port.down(self.bindings.inputs, self.links.command.first_mut(), self.tap, now);
         self.exchanges_end(id);
-        self.drop_forgotten(now);
-        self.tell_alive(now);
+        self.drop_commands_of_gone(now);
+        self.report_alive(now);
     }
 
     fn port_bus(&mut self, id: PortId, state: BusState, now: Instant) {
@@ -304,18 +304,18 @@ impl EngineView<'_> {
             (true, false) => self.exchanges_begin(id),
             _ => {}
         }
-        self.drop_forgotten(now);
-        self.tell_alive(now);
+        self.drop_commands_of_gone(now);
+        self.report_alive(now);
     }
 
     /// Drops commands of devices that are gone.
-    pub(crate) fn drop_forgotten(&mut self, now: Instant) {
+    pub(crate) fn drop_commands_of_gone(&mut self, now: Instant) {
         if let Some(command) = self.links.command.first_mut() {
-            command.drop_forgotten(now);
+            command.drop_commands_of_gone(now);
             let deadline = command.deadline();
             self.arm(deadline);
         }
-        self.carry_outcomes();
+        self.pass_on_outcomes();
     }
 
     fn change_port(&mut self, id: PortId, change: impl FnOnce(&mut FieldPort)) {
@@ -329,7 +329,7 @@ impl EngineView<'_> {
 
     /// Reports dropped values and results of commands to their ports.
     pub(crate) fn carry_results(&mut self) {
-        self.carry_outcomes();
+        self.pass_on_outcomes();
         if self.store.take_has_lost() {
             for (port, queue) in self.ports.iter_mut().zip(self.store.edges.iter_mut()) {
                 add(&mut port.counters.values_expired, core::mem::take(&mut queue.lost) as usize);
@@ -337,7 +337,7 @@ impl EngineView<'_> {
         }
     }
 
-    pub(crate) fn carry_outcomes(&mut self) {
+    pub(crate) fn pass_on_outcomes(&mut self) {
         let Some(command) = self.links.command.first_mut() else { return };
         command.outcomes.take(|outcome| {
             if let Some(port) = find_port(self.ports, outcome.port) {
@@ -369,7 +369,7 @@ impl EngineView<'_> {
             let deadline = command.deadline();
             self.arm(deadline);
         }
-        self.carry_outcomes();
+        self.pass_on_outcomes();
         self.image_changed();
         let dirty = self.store.outbox.dirty();
         let (state, mut waits) = (&self.links.state, false);
@@ -421,7 +421,7 @@ impl EngineView<'_> {
     }
 
     /// The next frame to the field.
-    fn next_downward(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, Downward)> {
+    fn next_field_frame(&mut self, out: &mut [u8], now: Instant) -> Option<(PortId, FieldFrame)> {
         let (image, bindings) = (&self.store.image, self.bindings.outputs());
         let mut left = self.ports.len();
         for port in self.ports.iter_mut() {

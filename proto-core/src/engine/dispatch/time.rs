@@ -197,9 +197,9 @@ impl EngineView<'_> {
             silence_commands(frame.bindings.of(self.bindings.inputs), self.links.command.first_mut(), now);
         }
         if timed_out {
-            self.drop_forgotten(now);
+            self.drop_commands_of_gone(now);
             self.image_changed();
-            self.tell_alive(now);
+            self.report_alive(now);
         }
         self.expire_waiting();
     }

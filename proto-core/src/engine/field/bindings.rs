@@ -74,14 +74,14 @@ impl InputBind {
 /// One word of the rules of a field: its meaning, and a number or bits.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rule {
-    pub is: Is,
+    pub kind: RuleKind,
     /// As bytes, which need no alignment, to keep a binding small.
     bits: [u8; 8],
 }
 
 /// The meaning of a word of a rule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Is {
+pub(crate) enum RuleKind {
     /// Scale and offset.
     Scale,
     /// The variable takes the number in two's complement.
@@ -111,8 +111,8 @@ pub(crate) enum Is {
 }
 
 impl Rule {
-    pub(crate) const fn new(is: Is, number: u64) -> Self {
-        Self { is, bits: number.to_be_bytes() }
+    pub(crate) const fn new(kind: RuleKind, number: u64) -> Self {
+        Self { kind, bits: number.to_be_bytes() }
     }
 
     pub(crate) const fn bits(self) -> u64 {

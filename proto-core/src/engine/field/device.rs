@@ -11,7 +11,7 @@ use super::codec::{Codec, DeviceCodec, MAX_DEVICE_FRAMES, Reader};
 use super::format::{DeviceFormat, judge, judge_can, probe, probe_all};
 use super::frames::{Accepted, FrameContext};
 use super::outgoing::Outgoing;
-use super::output::Downward;
+use super::output::FieldFrame;
 use super::port::{FieldPort, came, keep_why};
 use super::sender::{DIGEST_SEED, digest};
 use super::texts::{MAX_TEXTS, texts_of};
@@ -134,7 +134,7 @@ impl FieldPort {
         let (now, usable, bytes) = (store.now, self.is_usable(), *rest);
         let mut left = core::mem::take(rest);
         if matches!(self.codec, Codec::Device(DeviceCodec { inputs: 0, .. })) {
-            self.not_asked_for(bytes, tap, now);
+            self.reject_without_input(bytes, tap, now);
             return accepted;
         }
         self.discard_waiting(bytes, tap, now);
@@ -295,7 +295,7 @@ impl FieldPort {
         bindings: Outputs<'_>,
         out: &mut [u8],
         now: Instant,
-    ) -> Option<Downward> {
+    ) -> Option<FieldFrame> {
         let Codec::Device(device) = &self.codec else { return None };
         let nth = self.sender.next_can;
         let (frames_sent, reply) = (self.sender.frames_sent, self.reply);
@@ -327,8 +327,8 @@ impl FieldPort {
         };
         let frame = out.get(..len).unwrap_or(&[]);
         let downward = match device.reader {
-            Some(_) => Downward::Bytes(len),
-            None => Downward::Can(CanFrame::cut(format.key.id(), frame)),
+            Some(_) => FieldFrame::Bytes(len),
+            None => FieldFrame::Can(CanFrame::cut(format.key.id(), frame)),
         };
         let is_last = nth.saturating_add(1) >= formats.len();
         self.counters.sent(len);

@@ -10,8 +10,8 @@
 use super::event::{Event, Outcome, Reading};
 use super::exchanges::{ExchangeItem, Piece};
 use super::line::{ExchangeTable, Line};
-use super::requests::Maker;
-use super::turns::{Ended, News, Turns};
+use super::requests::RequestBuilder;
+use super::turns::{Ended, PeerChange, Turns};
 use crate::image::GroupId;
 use crate::modbus::rtu::MAX_ADU;
 use crate::recipe::model::MAX_STREAM_FRAME;
@@ -39,7 +39,7 @@ impl Events<'_, '_> {
     /// Values in the image have changed: checks the bits, and makes the requests of events whose values are complete.
     pub(crate) fn image_changed(
         &mut self,
-        maker: &Maker<'_>,
+        maker: &RequestBuilder<'_>,
         sources: &Sources<impl Fn(GroupId) -> Instant>,
         kept: &mut [Piece],
     ) {
@@ -52,7 +52,12 @@ impl Events<'_, '_> {
         self.note_expiry();
     }
 
-    fn read_bit(&mut self, nth: usize, maker: &Maker<'_>, sources: &Sources<impl Fn(GroupId) -> Instant>) {
+    fn read_bit(
+        &mut self,
+        nth: usize,
+        maker: &RequestBuilder<'_>,
+        sources: &Sources<impl Fn(GroupId) -> Instant>,
+    ) {
         let Some(item) = self.items.get_mut(nth) else { return };
         let Some(trigger) = &mut item.trigger else { return };
         let Some(at) = maker.image.known_since(trigger.var) else { return trigger.forget() };
@@ -127,7 +132,7 @@ impl Events<'_, '_> {
     fn freeze(
         &mut self,
         nth: usize,
-        maker: &Maker<'_>,
+        maker: &RequestBuilder<'_>,
         sources: &Sources<impl Fn(GroupId) -> Instant>,
         kept: &mut [Piece],
     ) {
@@ -300,12 +305,12 @@ impl Events<'_, '_> {
     }
 
     /// Applies what a failure or a sign of life says about the peer of an exchange.
-    pub(crate) fn note(&mut self, nth: usize, news: News) {
+    pub(crate) fn note(&mut self, nth: usize, news: PeerChange) {
         let Some(which) = self.table.rows.get(nth).map(|row| row.peer) else { return };
         match news {
-            News::Nothing => {}
-            News::Away => self.end_waiting(Some(which), Outcome::Away),
-            News::Started => {
+            PeerChange::Nothing => {}
+            PeerChange::Away => self.end_waiting(Some(which), Outcome::Away),
+            PeerChange::Started => {
                 for (item, row) in self.items.iter_mut().zip(self.table.rows.iter()) {
                     // Its earlier replies no longer count.
                     if let Some(sign) = item.restart.as_mut().filter(|_| row.peer == which) {

@@ -12,12 +12,12 @@ use super::format::{DeviceFormat, elements, judge_can};
 use super::frames::{Accepted, FrameContext};
 use super::line::{ExchangeTable, Flight, Line, Over, Phase};
 use super::modbus_tcp;
-use super::output::Downward;
+use super::output::FieldFrame;
 use super::pending::{Heard, PendingReplies};
 use super::port::{FieldPort, came, keep_why};
-use super::requests::Maker;
+use super::requests::RequestBuilder;
 use super::texts::TextBind;
-use super::turns::{Cause, Ended, News};
+use super::turns::{Cause, Ended, PeerChange};
 use crate::device::{Found, Probe};
 use crate::engine::counters::{PortCounters, add, bump};
 use crate::engine::link::command::CommandLink;
@@ -156,13 +156,13 @@ impl FieldPort {
             let answer = Answer::of(frame, pending.expected().is_some(), is_tcp);
             let before = accepted.frames;
             let taken = match heard {
-                Ok(heard) => take_heard(&mut frames, texts, heard, (flight, frame, answer), &mut accepted),
+                Ok(heard) => apply_heard(&mut frames, texts, heard, (flight, frame, answer), &mut accepted),
                 // Already counted by the search.
                 Err(why @ Rejection::NoFrame) => Taken::nothing(Err(why)),
                 Err(why) => Taken::nothing(frames.rejected(why)),
             };
             let verdict = taken.verdict;
-            if heed(line, items, &mut table, (bindings, frames.counters), taken, flight, now) {
+            if apply_effect(line, items, &mut table, (bindings, frames.counters), taken, flight, now) {
                 self.sender.sent();
             }
             tap.record(|| came(self.id, now, verdict, None, [frame, &[], &[]]));
@@ -241,7 +241,7 @@ impl FieldPort {
         };
         let of_reply = Answer { data: frame.data(), code, is_modbus: false, is_tcp: false };
         let taken = match pending.classify(answer, is, |_| false) {
-            Some(heard) => take_heard(&mut frames, texts, heard, (flight, frame.data(), of_reply), accepted),
+            Some(heard) => apply_heard(&mut frames, texts, heard, (flight, frame.data(), of_reply), accepted),
             None => {
                 let answers = pending.answers().map(|format| (None, format));
                 let unasked = pending.unasked();
@@ -255,13 +255,13 @@ impl FieldPort {
                 if let Some(nth) = nth {
                     look_for_restart(line, items, &mut table, bindings, (nth, frame.data()), now);
                 }
-                signs(line, items, &mut table, Sign::Unasked(nth), now);
+                note_sign_of_life(line, items, &mut table, Effect::Unasked(nth), now);
                 self.sender.frames_accepted(1, usable, &mut self.counters, now);
                 return Ok(());
             }
         };
         let verdict = taken.verdict;
-        heed(line, items, &mut table, (bindings, frames.counters), taken, flight, now);
+        apply_effect(line, items, &mut table, (bindings, frames.counters), taken, flight, now);
         verdict
     }
 
@@ -273,7 +273,7 @@ impl FieldPort {
         mut view: View<'_>,
         out: &mut [u8],
         now: Instant,
-    ) -> Option<Downward> {
+    ) -> Option<FieldFrame> {
         if !self.is_usable() {
             return None;
         }
@@ -282,7 +282,7 @@ impl FieldPort {
         // Taken out, because the rest of the codec makes the frames.
         let mut line = codec.line.take()?;
         let (items, mut table, kept) = view.served(&line);
-        let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
+        let maker = RequestBuilder { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
         let request = maker.next(&mut line, (items, &mut table, kept), &mut self.counters, is_busy, out);
         let is_on_can = codec.reader.is_none();
         if let (Some(_), Some(Reader::Search(framer))) = (&request, &mut codec.reader)
@@ -298,15 +298,15 @@ impl FieldPort {
         self.sender.handed_over_beside();
         self.counters.sent(len);
         if !is_on_can {
-            return Some(Downward::Bytes(len));
+            return Some(FieldFrame::Bytes(len));
         }
         let item = view_item(&mut view, self.line()?, item)?;
         if let Asks::Remote { id, len } = item.asks {
-            return CanFrame::remote(id, len.into()).map(Downward::Can);
+            return CanFrame::remote(id, len.into()).map(FieldFrame::Can);
         }
         let frame = out.get(..len).unwrap_or(&[]);
         let id = item.request.as_ref()?.key.id();
-        Some(Downward::Can(CanFrame::cut(id, frame)))
+        Some(FieldFrame::Can(CanFrame::cut(id, frame)))
     }
 
     /// The request has left.
@@ -396,7 +396,7 @@ impl FieldPort {
         let Some(mut line) = codec.line.take() else { return };
         let (items, mut table, kept) = view.served(&line);
         let stale_after = self.sender.stale_after();
-        let maker = Maker { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
+        let maker = RequestBuilder { image, bindings, codec, sender: &self.sender, reply: self.reply, now };
         let sources = Sources { first_of_links, up_since, stale_after, is_usable };
         let mut events = Events { items, table: &mut table, line: &mut line, now };
         events.image_changed(&maker, &sources, kept);
@@ -414,8 +414,8 @@ impl FieldPort {
         let (items, mut table) = view.of(line);
         for item in items {
             (item.digest, item.is_owed) = (None, false);
-            if let Some(sign) = &mut item.restart {
-                sign.was_there = None;
+            if let Some(effect) = &mut item.restart {
+                effect.was_there = None;
             }
         }
         line.begin(&mut table, now);
@@ -433,7 +433,7 @@ fn view_item<'v>(view: &'v mut View<'_>, line: &Line, nth: u8) -> Option<&'v Exc
 
 /// What a frame says about the exchanges.
 #[derive(Clone, Copy)]
-enum Sign {
+enum Effect {
     Nothing,
     /// A reply to the request in flight, with the code of a refusal.
     Answer(Ended, u16),
@@ -479,59 +479,61 @@ impl<'f> Answer<'f> {
 /// How a frame was taken.
 struct Taken<'f> {
     verdict: Result<(), Rejection>,
-    sign: Sign,
+    effect: Effect,
     /// The exchange whose reply was taken, and the reply's data.
-    told: Option<(u8, &'f [u8])>,
+    reply_data: Option<(u8, &'f [u8])>,
 }
 
 impl Taken<'_> {
     /// A frame that says nothing about the exchanges.
     const fn nothing(verdict: Result<(), Rejection>) -> Self {
-        Self { verdict, sign: Sign::Nothing, told: None }
+        Self { verdict, effect: Effect::Nothing, reply_data: None }
     }
 }
 
 /// Takes the values of a classified frame.
-fn take_heard<'f>(
+fn apply_heard<'f>(
     frames: &mut FrameContext<'_>,
     texts: &[TextBind],
     heard: Heard<'_>,
     (flight, frame, answer): (Option<Flight>, &'f [u8], Answer<'f>),
     accepted: &mut Accepted,
 ) -> Taken<'f> {
-    let mut told = None;
-    let (verdict, sign) = match heard {
+    let mut reply_data = None;
+    let (verdict, effect) = match heard {
         Heard::Reply(Some(reply)) => {
-            told = flight.map(|flight| (flight.exchange, answer.data));
+            reply_data = flight.map(|flight| (flight.exchange, answer.data));
             let slot = usize::from(reply.slot);
             let verdict = frames.take_device(&reply.format, texts, answer.data, slot, accepted);
             let since = flight.filter(|_| !answer.is_tcp).and_then(|flight| flight.unanswered());
             if let Some(since) = since {
                 frames.store.was_asked(slot, since);
             }
-            (verdict, Sign::Answer(Ended::Good, 0))
+            (verdict, Effect::Answer(Ended::Good, 0))
         }
         // A confirmed write.
-        Heard::Reply(None) => (Ok(()), Sign::Answer(Ended::Good, 0)),
-        Heard::ReplyOrEcho => (Ok(()), Sign::ReplyOrEcho),
-        Heard::Pending(pending) => (take_other(frames, Some(pending), texts, frame, accepted), Sign::Pending),
+        Heard::Reply(None) => (Ok(()), Effect::Answer(Ended::Good, 0)),
+        Heard::ReplyOrEcho => (Ok(()), Effect::ReplyOrEcho),
+        Heard::Pending(pending) => {
+            (take_other(frames, Some(pending), texts, frame, accepted), Effect::Pending)
+        }
         Heard::Refusal(refusal) => (
             take_other(frames, refusal, texts, frame, accepted).and(Err(Rejection::Refused)),
-            Sign::Answer(refused_with(answer.code, answer.is_modbus), answer.code),
+            Effect::Answer(refused_with(answer.code, answer.is_modbus), answer.code),
         ),
-        Heard::Late { exchange, is_pending } => (Err(Rejection::Late), Sign::Late { exchange, is_pending }),
-        Heard::Ambiguous => (Err(Rejection::Late), Sign::Ambiguous),
+        Heard::Late { exchange, is_pending } => (Err(Rejection::Late), Effect::Late { exchange, is_pending }),
+        Heard::Ambiguous => (Err(Rejection::Late), Effect::Ambiguous),
         Heard::Unasked(format, slot, nth) => {
-            told = nth.map(|nth| (nth, frame));
-            (frames.take_device(format, texts, frame, slot, accepted), Sign::Unasked(nth))
+            reply_data = nth.map(|nth| (nth, frame));
+            (frames.take_device(format, texts, frame, slot, accepted), Effect::Unasked(nth))
         }
-        Heard::Echo => (Err(Rejection::NoFrame), Sign::Nothing),
+        Heard::Echo => (Err(Rejection::NoFrame), Effect::Nothing),
     };
-    Taken { verdict, sign, told }
+    Taken { verdict, effect, reply_data }
 }
 
 /// Applies what a frame says about the exchanges. Returns whether the line waited for it.
-fn heed(
+fn apply_effect(
     line: &mut Line,
     items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
@@ -540,12 +542,12 @@ fn heed(
     flight: Option<Flight>,
     now: Instant,
 ) -> bool {
-    if let Some(told) = taken.told.filter(|_| taken.verdict.is_ok()) {
-        look_for_restart(line, items, table, bindings, told, now);
+    if let Some(reply_data) = taken.reply_data.filter(|_| taken.verdict.is_ok()) {
+        look_for_restart(line, items, table, bindings, reply_data, now);
     }
-    match (taken.sign, flight) {
-        (Sign::Pending, Some(flight)) => goes_on(line, items, table, flight, now),
-        (Sign::Answer(ended, code), Some(flight)) => {
+    match (taken.effect, flight) {
+        (Effect::Pending, Some(flight)) => still_processing(line, items, table, flight, now),
+        (Effect::Answer(ended, code), Some(flight)) => {
             // After a repetition, two identical frames may be the replies to both requests.
             let is_sure = !flight.is_repetition() && !is_outstanding(table, flight, now);
             if is_sure && (flight.may_be_echo || line.echo.is_some()) {
@@ -555,8 +557,8 @@ fn heed(
             answered(line, items, table, counters, flight, (ended, code), now);
             return was_waiting;
         }
-        (Sign::ReplyOrEcho, _) => line.heard_reply_or_echo(),
-        (sign, _) => signs(line, items, table, sign, now),
+        (Effect::ReplyOrEcho, _) => line.heard_reply_or_echo(),
+        (effect, _) => note_sign_of_life(line, items, table, effect, now),
     }
     false
 }
@@ -640,7 +642,7 @@ fn answered(
 }
 
 /// The peer is still processing the request, so it is up.
-fn goes_on(
+fn still_processing(
     line: &mut Line,
     items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
@@ -679,21 +681,21 @@ fn look_for_restart(
     now: Instant,
 ) {
     let nth = usize::from(exchange);
-    let Some(ExchangeItem { restart: Some(sign), reply: Some(reply), .. }) = items.get_mut(nth) else {
+    let Some(ExchangeItem { restart: Some(effect), reply: Some(reply), .. }) = items.get_mut(nth) else {
         return;
     };
     let fields = elements(reply.format.bindings.of(bindings));
-    let found = reply.format.layout.values(fields, data).nth(usize::from(sign.element));
+    let found = reply.format.layout.values(fields, data).nth(usize::from(effect.element));
     let Some(Ok(Some(value))) = found else { return };
-    let is_there = value.as_f64() == sign.value;
-    if sign.was_there.replace(is_there) != Some(false) || !is_there {
+    let is_there = value.as_f64() == effect.value;
+    if effect.was_there.replace(is_there) != Some(false) || !is_there {
         return;
     }
     let Some(which) = table.rows.get(nth).map(|row| row.peer) else { return };
     let own = line.flight().map(|flight| usize::from(flight.exchange)).filter(|own| *own == nth);
     line.turns(table, |turns| {
         // If its failures also show a restart, it is the same one.
-        if turns.heard(which, own, now) != News::Started {
+        if turns.heard(which, own, now) != PeerChange::Started {
             turns.started(which, own, now);
         }
     });
@@ -710,36 +712,36 @@ fn has_restarted(
 ) {
     line.look(now);
     let mut events = Events { items, table, line, now };
-    events.note(nth, News::Started);
+    events.note(nth, PeerChange::Started);
     // The peer has lost everything it was asked to do before.
     events.end_waiting(Some(which), Outcome::Away);
 }
 
 /// A frame that is no reply to the request in flight shows that its peer is up.
-fn signs(
+fn note_sign_of_life(
     line: &mut Line,
     items: &mut [ExchangeItem],
     table: &mut ExchangeTable<'_>,
-    sign: Sign,
+    effect: Effect,
     now: Instant,
 ) {
-    let nth = match (sign, line.flight()) {
-        (Sign::Late { exchange, .. }, _) | (Sign::Unasked(Some(exchange)), _) => usize::from(exchange),
-        (Sign::Ambiguous, Some(flight)) => usize::from(flight.exchange),
+    let nth = match (effect, line.flight()) {
+        (Effect::Late { exchange, .. }, _) | (Effect::Unasked(Some(exchange)), _) => usize::from(exchange),
+        (Effect::Ambiguous, Some(flight)) => usize::from(flight.exchange),
         _ => return,
     };
     let Some(row) = table.rows.get_mut(nth) else { return };
     let which = row.peer;
-    if matches!(sign, Sign::Late { is_pending: false, .. }) {
+    if matches!(effect, Effect::Late { is_pending: false, .. }) {
         row.late_reply_came();
     }
-    if !matches!(sign, Sign::Unasked(_))
+    if !matches!(effect, Effect::Unasked(_))
         && let Some(peer) = table.peers.get_mut(usize::from(which))
     {
         bump(&mut peer.counters.late_replies);
     }
     // A late reply shows that the peer has executed the request.
-    let own = matches!(sign, Sign::Late { is_pending: false, .. }).then_some(nth);
+    let own = matches!(effect, Effect::Late { is_pending: false, .. }).then_some(nth);
     let news = line.turns(table, |turns| turns.heard(which, own, now));
     line.look(now);
     Events { items, table, line, now }.note(nth, news);

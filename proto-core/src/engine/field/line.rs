@@ -6,7 +6,7 @@
 use super::line_timing::LineTiming;
 use super::modbus_tcp::Transactions;
 use super::sender::{DIGEST_SEED, digest};
-use super::turns::{Cause, Ended, News, PeerState, Row, Turns};
+use super::turns::{Cause, Ended, PeerChange, PeerState, Row, Turns};
 use crate::config::{Echo, Span};
 use crate::device::Probe;
 use crate::modbus::rtu::Expected;
@@ -76,7 +76,7 @@ pub(crate) enum Over {
     /// It is repeated.
     Repeated,
     /// It is given up.
-    GivenUp(News),
+    GivenUp(PeerChange),
     /// It may have been executed: see [`Failure::Echo`].
     Unconfirmed,
 }
@@ -359,7 +359,7 @@ impl Line {
         flight: Flight,
         ended: Ended,
         now: Instant,
-    ) -> (Ended, News) {
+    ) -> (Ended, PeerChange) {
         let ended = if flight.is_ambiguous { Ended::Unclear } else { ended };
         // The reply may be a late one to the first transmission; that to the repetition is still to come then.
         let sent = if matches!(self.phase, Phase::Sending(_)) { now } else { self.sent };
@@ -406,7 +406,7 @@ impl Line {
         let yields = table.rows.iter().any(|row| row.stop_at().is_some_and(|at| at <= now));
         let sent = self.sent;
         let retries = table.row_of(flight).map_or(0, |row| row.retries(flight.cause));
-        let Some(peer) = table.peer_of(flight) else { return Over::GivenUp(News::Nothing) };
+        let Some(peer) = table.peer_of(flight) else { return Over::GivenUp(PeerChange::Nothing) };
         let is_there = peer.presence() == Presence::Up;
         let counters = &mut peer.counters;
         let counter = match failure {
@@ -451,7 +451,7 @@ impl Line {
         flight: Flight,
         failure: Failure,
         now: Instant,
-    ) -> News {
+    ) -> PeerChange {
         let sent = self.sent;
         leave_outstanding(table, flight, flight.repeated.saturating_add(1), sent, now);
         let nth = usize::from(flight.exchange);

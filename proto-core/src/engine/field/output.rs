@@ -14,7 +14,7 @@ use crate::time::Instant;
 use crate::wire::can::CanFrame;
 
 /// A frame to send to the field; bytes are given by their length.
-pub(crate) enum Downward {
+pub(crate) enum FieldFrame {
     Bytes(usize),
     Can(CanFrame),
 }
@@ -27,7 +27,7 @@ impl FieldPort {
         bindings: Outputs<'_>,
         out: &mut [u8],
         now: Instant,
-    ) -> Option<Downward> {
+    ) -> Option<FieldFrame> {
         if !self.sender.may_show(image, now) {
             bump(&mut self.counters.stale_cycles);
             self.sender.dismiss();
@@ -46,7 +46,7 @@ impl FieldPort {
         bindings: Outputs<'_>,
         out: &mut [u8],
         now: Instant,
-    ) -> Option<Downward> {
+    ) -> Option<FieldFrame> {
         let Codec::Stream { output: Some(layout), .. } = &self.codec else {
             self.sender.dismiss();
             return None;
@@ -65,7 +65,7 @@ impl FieldPort {
                 bump(&mut self.counters.frames_out);
                 add(&mut self.counters.bytes_out, len);
                 self.sender.handed_over();
-                Some(Downward::Bytes(len))
+                Some(FieldFrame::Bytes(len))
             }
             _ => {
                 self.sender.dismiss();
@@ -74,7 +74,7 @@ impl FieldPort {
         }
     }
 
-    fn next_can(&mut self, image: &Image, bindings: Outputs<'_>, now: Instant) -> Option<Downward> {
+    fn next_can(&mut self, image: &Image, bindings: Outputs<'_>, now: Instant) -> Option<FieldFrame> {
         if self.sender.next_can == 0 && !self.can_is_news(image, bindings, now) {
             self.sender.dismiss();
             return None;
@@ -91,7 +91,7 @@ impl FieldPort {
         } else {
             self.sender.next_can = nth.saturating_add(1);
         }
-        Some(Downward::Can(frame))
+        Some(FieldFrame::Can(frame))
     }
 
     /// The `nth` frame of the cycle, and whether it is the last.

@@ -156,7 +156,7 @@ impl FieldPort {
             return accepted;
         };
         let Some(layout) = input else {
-            self.not_asked_for(bytes, tap, now);
+            self.reject_without_input(bytes, tap, now);
             return accepted;
         };
         let (reply, counters) = (&mut self.reply, &mut self.counters);
@@ -185,7 +185,7 @@ impl FieldPort {
     }
 
     /// Rejects bytes for a port whose recipe has no input part.
-    pub(crate) fn not_asked_for(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
+    pub(crate) fn reject_without_input(&mut self, bytes: &[u8], tap: &mut Tap, now: Instant) {
         bump(&mut self.counters.rejected_no_input);
         tap.record(|| came(self.id, now, Err(Rejection::NoInput), None, [bytes, &[], &[]]));
         keep(&mut self.last_rejection, Rejection::NoInput, None, bytes, now);

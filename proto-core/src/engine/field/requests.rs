@@ -22,7 +22,7 @@ use crate::modbus::rtu::{Expected, MAX_ADU};
 use crate::time::Instant;
 use crate::wire::can::CanId;
 
-pub(crate) struct Maker<'a> {
+pub(crate) struct RequestBuilder<'a> {
     pub image: &'a Image,
     pub bindings: Outputs<'a>,
     pub codec: &'a DeviceCodec,
@@ -31,7 +31,7 @@ pub(crate) struct Maker<'a> {
     pub now: Instant,
 }
 
-impl Maker<'_> {
+impl RequestBuilder<'_> {
     /// Checks values that trigger requests, and makes the next request. Returns its exchange and its length in `out`. A
     /// request that cannot be repeated is counted in `counters`.
     pub(crate) fn next(

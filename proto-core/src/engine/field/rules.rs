@@ -7,7 +7,7 @@
 
 use heapless::Vec;
 
-use super::bindings::{InputBind, InputTo, Is, Rule, Written};
+use super::bindings::{InputBind, InputTo, Rule, RuleKind, Written};
 use crate::config::{
     FieldSpec, InputBinding, InputRule, Limits, MapEntry, NO_TEXT, Outside, fitting_numbers,
 };
@@ -22,28 +22,29 @@ pub(crate) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + u
     let number = |is, number: f64| Some(Rule::new(is, number.to_bits()));
     match *field {
         FieldSpec::Limits(Limits { low, high, outside }) => {
-            let clamps = (outside == Outside::Clamp).then_some(Rule::new(Is::Clamps, 0));
-            words = [clamps, number(Is::Low, low), number(Is::High, high)];
+            let clamps = (outside == Outside::Clamp).then_some(Rule::new(RuleKind::Clamps, 0));
+            words = [clamps, number(RuleKind::Low, low), number(RuleKind::High, high)];
         }
         FieldSpec::Mapped(MapEntry { first, last, sent }) => {
             let value = |is, value: i64| Some(Rule::new(is, value.cast_unsigned()));
-            words = [value(Is::First, first), value(Is::Last, last), number(Is::Becomes, sent)];
+            words =
+                [value(RuleKind::First, first), value(RuleKind::Last, last), number(RuleKind::Becomes, sent)];
         }
         FieldSpec::InputRule(rule) => {
             words[0] = match rule {
-                InputRule::Int16 => Some(Rule::new(Is::TwosComplement, 0)),
-                InputRule::Comma => Some(Rule::new(Is::Comma, 0)),
-                InputRule::Else(becomes) => number(Is::Else, becomes),
-                InputRule::NoNumber(code) => number(Is::NoNumber, code),
+                InputRule::Int16 => Some(Rule::new(RuleKind::TwosComplement, 0)),
+                InputRule::Comma => Some(Rule::new(RuleKind::Comma, 0)),
+                InputRule::Else(becomes) => number(RuleKind::Else, becomes),
+                InputRule::NoNumber(code) => number(RuleKind::NoNumber, code),
                 InputRule::NoText(text) => {
                     let bytes = text.bytes();
                     let mut padded = [0; NO_TEXT];
                     padded.iter_mut().zip(bytes).for_each(|(slot, &byte)| *slot = byte);
-                    Some(Rule::new(Is::NoText(bytes.len() as u8), u64::from_le_bytes(padded)))
+                    Some(Rule::new(RuleKind::NoText(bytes.len() as u8), u64::from_le_bytes(padded)))
                 }
                 InputRule::ValidTo { var, bit } => {
                     let mask = bit.map_or(0, |bit| 1_u64.unbounded_shl(bit.into()));
-                    Some(Rule::new(Is::ValidTo, mask.unbounded_shl(32) | var.ordinal() as u64))
+                    Some(Rule::new(RuleKind::ValidTo, mask.unbounded_shl(32) | var.ordinal() as u64))
                 }
             };
         }
@@ -55,7 +56,7 @@ pub(crate) fn words_of(field: &FieldSpec) -> impl Iterator<Item = InputBind> + u
 /// The first word of a variable's rules.
 pub(crate) fn scale_word(scale: f32, offset: f32) -> InputBind {
     let high = u64::from(scale.to_bits()).unbounded_shl(32);
-    Rule::new(Is::Scale, high | u64::from(offset.to_bits())).to_bind()
+    Rule::new(RuleKind::Scale, high | u64::from(offset.to_bits())).to_bind()
 }
 
 /// The verdict on the value of an input field that writes a variable.
@@ -134,20 +135,20 @@ impl<'a> Rules<'a> {
         self.words.iter().filter_map(|word| if let InputTo::Rule(rule) = word.to { Some(rule) } else { None })
     }
 
-    fn find(self, is: Is) -> Option<Rule> {
-        self.iter().find(|rule| rule.is == is)
+    fn find(self, kind: RuleKind) -> Option<Rule> {
+        self.iter().find(|rule| rule.kind == kind)
     }
 
     /// The variable, or bits of it, that shows whether a value was taken.
     pub(crate) fn valid_to(self) -> Option<(SysVar, u8)> {
-        let rule = self.find(Is::ValidTo)?;
+        let rule = self.find(RuleKind::ValidTo)?;
         let [mask, var] = rule.halves();
         SysVar::from_ordinal(var as usize).map(|var| (var, mask as u8))
     }
 
     /// The lowest and the highest number within the limits.
     pub(crate) fn limits(self) -> Option<(f64, f64)> {
-        Some((self.find(Is::Low)?.number(), self.find(Is::High)?.number()))
+        Some((self.find(RuleKind::Low)?.number(), self.find(RuleKind::High)?.number()))
     }
 
     /// The verdict on a number, or on bytes that are none. `bytes` are those of the field.
@@ -156,12 +157,12 @@ impl<'a> Rules<'a> {
         value: Result<Scalar, Unreadable>,
         bytes: impl FnOnce() -> Option<&'a [u8]>,
     ) -> Taken {
-        let needs_bytes = self.iter().any(|rule| matches!(rule.is, Is::NoText(_) | Is::Comma));
+        let needs_bytes = self.iter().any(|rule| matches!(rule.kind, RuleKind::NoText(_) | RuleKind::Comma));
         let bytes = if needs_bytes { bytes() } else { None };
         if bytes.is_some_and(|bytes| self.is_no_text(bytes)) {
             return Taken::NoValue;
         }
-        let value = match self.find(Is::Comma) {
+        let value = match self.find(RuleKind::Comma) {
             None => value,
             Some(_) => read_comma(self.encoding, bytes.unwrap_or(&[])),
         };
@@ -171,7 +172,7 @@ impl<'a> Rules<'a> {
         let is_code = |rule: Rule| {
             let code = rule.number();
             let is_same = code == number || is_single && code as f32 == number as f32;
-            rule.is == Is::NoNumber && (is_same || code.is_nan() && number.is_nan())
+            rule.kind == RuleKind::NoNumber && (is_same || code.is_nan() && number.is_nan())
         };
         if self.iter().any(is_code) {
             return Taken::NoValue;
@@ -188,7 +189,7 @@ impl<'a> Rules<'a> {
     fn is_no_text(self, bytes: &[u8]) -> bool {
         let bytes = bytes.trim_ascii();
         self.iter().any(|rule| {
-            let Is::NoText(len) = rule.is else { return false };
+            let RuleKind::NoText(len) = rule.kind else { return false };
             rule.bits().to_le_bytes().get(..usize::from(len)) == Some(bytes)
         })
     }
@@ -203,7 +204,7 @@ impl<'a> Rules<'a> {
                 number * f64::from(scale) + f64::from(offset)
             }
         };
-        if self.find(Is::TwosComplement).is_some() {
+        if self.find(RuleKind::TwosComplement).is_some() {
             let number = round(number);
             let is_short = (f64::from(i16::MIN)..=f64::from(i16::MAX)).contains(&number);
             return is_short.then(|| Scalar::Word((number as i16).cast_unsigned()));
@@ -216,14 +217,14 @@ impl<'a> Rules<'a> {
     }
 
     pub(crate) fn scale(self) -> (f32, f32) {
-        self.find(Is::Scale).map_or((1.0, 0.0), |rule| rule.halves().map(f32::from_bits).into())
+        self.find(RuleKind::Scale).map_or((1.0, 0.0), |rule| rule.halves().map(f32::from_bits).into())
     }
 
     fn limited(self, number: f64) -> Option<f64> {
         let (Some((low, high)), Some(encoding)) = (self.limits(), &self.encoding) else {
             return Some(number);
         };
-        let outside = if self.find(Is::Clamps).is_some() { Outside::Clamp } else { Outside::Refuse };
+        let outside = if self.find(RuleKind::Clamps).is_some() { Outside::Clamp } else { Outside::Refuse };
         let number = Limits { low, high, outside }.take(encoding, number);
         (!number.is_nan()).then_some(number)
     }
@@ -232,10 +233,10 @@ impl<'a> Rules<'a> {
     fn mapped(self, number: f64) -> Option<Option<f64>> {
         let (mut first, mut last, mut is_table) = (0_i64, 0_i64, false);
         for rule in self.iter() {
-            match rule.is {
-                Is::First => first = rule.bits().cast_signed(),
-                Is::Last => last = rule.bits().cast_signed(),
-                Is::Becomes => {
+            match rule.kind {
+                RuleKind::First => first = rule.bits().cast_signed(),
+                RuleKind::Last => last = rule.bits().cast_signed(),
+                RuleKind::Becomes => {
                     is_table = true;
                     if (MapEntry { first, last, sent: 0.0 }).has(number) {
                         return Some(Some(rule.number()));
@@ -244,18 +245,18 @@ impl<'a> Rules<'a> {
                 _ => {}
             }
         }
-        is_table.then(|| self.find(Is::Else).map(Rule::number))
+        is_table.then(|| self.find(RuleKind::Else).map(Rule::number))
     }
 
     /// The range of numbers that the variable takes, before scale and offset; `None` if it is not a single range.
     pub(crate) fn range(self) -> Option<(f64, f64)> {
-        let is_table = self.find(Is::Becomes).is_some();
-        let of_limits = self.limits().filter(|_| self.find(Is::Clamps).is_none());
+        let is_table = self.find(RuleKind::Becomes).is_some();
+        let of_limits = self.limits().filter(|_| self.find(RuleKind::Clamps).is_none());
         if is_table || self.overflow == Overflow::Wrap {
             return of_limits.filter(|_| !is_table);
         }
         let variable =
-            if self.find(Is::TwosComplement).is_some() { ScalarType::Short } else { self.var.ty() };
+            if self.find(RuleKind::TwosComplement).is_some() { ScalarType::Short } else { self.var.ty() };
         let (scale, offset) = self.scale();
         let fitting = self
             .encoding

@@ -182,7 +182,7 @@ pub(crate) enum Ended {
 
 /// What a failure or a sign of life changes for the peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum News {
+pub(crate) enum PeerChange {
     Nothing,
     /// The peer is away from now on.
     Away,
@@ -620,8 +620,8 @@ impl Turns<'_> {
     }
 
     /// A request ended with a reply of the peer.
-    pub(crate) fn answered(&mut self, nth: usize, cause: Cause, ended: Ended, now: Instant) -> News {
-        let Some(row) = self.rows.get_mut(nth) else { return News::Nothing };
+    pub(crate) fn answered(&mut self, nth: usize, cause: Cause, ended: Ended, now: Instant) -> PeerChange {
+        let Some(row) = self.rows.get_mut(nth) else { return PeerChange::Nothing };
         let which = row.peer;
         (row.was_answered, row.is_unconfirmed, row.opens) = (true, false, Opens::No);
         match ended {
@@ -643,14 +643,14 @@ impl Turns<'_> {
             row.wait.not_before = now + row.times.timeout;
         }
         if ended == Ended::Unconfirmed {
-            return News::Nothing;
+            return PeerChange::Nothing;
         }
         self.heard(which, Some(nth), now)
     }
 
     /// A sign of life of a peer. `own` is the row whose reply it is, if any.
-    pub(crate) fn heard(&mut self, which: u8, own: Option<usize>, now: Instant) -> News {
-        let Some(peer) = self.peers.get_mut(usize::from(which)) else { return News::Nothing };
+    pub(crate) fn heard(&mut self, which: u8, own: Option<usize>, now: Instant) -> PeerChange {
+        let Some(peer) = self.peers.get_mut(usize::from(which)) else { return PeerChange::Nothing };
         let was_away = peer.is_away();
         let has_started = peer.was_absent();
         (peer.presence, peer.was_heard, peer.failures) = (Presence::Up, true, 0);
@@ -667,10 +667,10 @@ impl Turns<'_> {
             }
         }
         if !has_started {
-            return News::Nothing;
+            return PeerChange::Nothing;
         }
         self.started(which, own, now);
-        News::Started
+        PeerChange::Started
     }
 
     /// The peer has started: its start exchanges are due, except a row that was just answered, unless another one has
@@ -686,11 +686,11 @@ impl Turns<'_> {
     }
 
     /// The peer has not answered a request that first left at `sent`.
-    pub(crate) fn failed(&mut self, nth: usize, cause: Cause, now: Instant, sent: Instant) -> News {
-        let Some(row) = self.rows.get_mut(nth) else { return News::Nothing };
+    pub(crate) fn failed(&mut self, nth: usize, cause: Cause, now: Instant, sent: Instant) -> PeerChange {
+        let Some(row) = self.rows.get_mut(nth) else { return PeerChange::Nothing };
         let (timeout, which) = (row.times.timeout, row.peer);
         let Some(peer) = self.peers.get_mut(usize::from(which)) else {
-            return News::Nothing;
+            return PeerChange::Nothing;
         };
         if row.opens == Opens::Taken {
             // A state still has to come first. A pure start may have been received.
@@ -714,10 +714,10 @@ impl Turns<'_> {
         peer.failures = peer.failures.saturating_add(1);
         let was_away = peer.is_away();
         if !was_away && !self.is_silent(which) {
-            return News::Nothing;
+            return PeerChange::Nothing;
         }
         let Some(peer) = self.peers.get_mut(usize::from(which)) else {
-            return News::Nothing;
+            return PeerChange::Nothing;
         };
         let wait = wait(peer.failures, timeout);
         peer.presence = Presence::Down;
@@ -727,7 +727,7 @@ impl Turns<'_> {
         for row in self.rows.iter_mut().filter(|row| row.peer == which && !row.kind.stops) {
             row.wait = Wait::NONE;
         }
-        if was_away { News::Nothing } else { News::Away }
+        if was_away { PeerChange::Nothing } else { PeerChange::Away }
     }
 
     /// Whether enough exchanges of a peer were not answered since it was heard.

@@ -25,7 +25,7 @@ use crate::wire::scalar::Scalar;
 /// A command that is not acknowledged this long after it was picked is dropped.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
 /// Two losses of the second connection within this time mean that the controller accepts only one (D26).
-const STRIKES_WITHIN: Duration = Duration::from_secs(10);
+const LOST_AGAIN_WITHIN: Duration = Duration::from_secs(10);
 /// A lost connection normally reopens within this time; until then no other is given up for a stop.
 const OPEN_AGAIN: Duration = Duration::from_millis(500);
 /// Replies that arrive within this time may make room for a stop that was just picked.
@@ -49,9 +49,9 @@ pub(crate) struct CommandLink {
     /// Number of commands at the front of the queue that an urgent command has overtaken.
     overtaken: usize,
     /// When the second connection was last lost, or the first because of it.
-    struck_at: Option<Instant>,
+    second_lost_at: Option<Instant>,
     /// Until then no connection is given up for a stop that cannot be sent.
-    way_made_until: Instant,
+    no_reopening_until: Instant,
     /// The newest command that each port's values picked, and the value.
     picked: [Option<(u16, i64)>; MAX_PORTS],
     /// The newest value of each port that gave no command.
@@ -78,8 +78,8 @@ impl CommandLink {
             stops: Stops::new(),
             stops_now: false,
             overtaken: 0,
-            struck_at: None,
-            way_made_until: Instant::ZERO,
+            second_lost_at: None,
+            no_reopening_until: Instant::ZERO,
             picked: [None; MAX_PORTS],
             dropped: [None; MAX_PORTS],
             failed: FailedCommands::NONE,
@@ -148,7 +148,7 @@ impl CommandLink {
             if value == 0 && !names_idle {
                 return Picked::Nothing;
             }
-            self.tell(port, DropReason::Unknown, (field, value), now);
+            self.note_dropped(port, DropReason::Unknown, (field, value), now);
             return Picked::Unknown;
         };
         if len == 0 {
@@ -157,7 +157,7 @@ impl CommandLink {
         // The press of a stop button may be among the input discarded after sleep; an extra stop does no harm.
         let is_held_stop = woke && keyword.is_urgent();
         if !acts && !is_held_stop {
-            self.tell(port, DropReason::Based, (field, value), now);
+            self.note_dropped(port, DropReason::Based, (field, value), now);
             return Picked::Based;
         }
         let mut waiting = Waiting { port, entry, field, value, since: now, nth };
@@ -165,7 +165,7 @@ impl CommandLink {
             self.is_newest(&waiting);
             self.stops_now = true;
             self.stops.push(keyword, waiting);
-            self.no_way_before(now + ROOM_WITHIN);
+            self.no_reopening_before(now + ROOM_WITHIN);
             return Picked::Command { reply: ReplyCode::Pending, is_dropped: false };
         }
         if self.stops_now {
@@ -180,7 +180,7 @@ impl CommandLink {
             false => Some(DropReason::NoLink),
         };
         if let Some(why) = why {
-            self.tell(port, why, (field, value), now);
+            self.note_dropped(port, why, (field, value), now);
         }
         let is_dropped = why.is_some();
         let reply = if is_dropped && !self.stops_now { ReplyCode::NotSent } else { ReplyCode::Pending };
@@ -195,7 +195,7 @@ impl CommandLink {
     }
 
     /// Notes why a value gave no command.
-    fn tell(&mut self, port: PortId, why: DropReason, (field, value): (u8, i64), now: Instant) {
+    fn note_dropped(&mut self, port: PortId, why: DropReason, (field, value): (u8, i64), now: Instant) {
         let place = self.fields.get(usize::from(field)).map_or((0, 0), |field| field.place);
         if let Some(last) = self.dropped.get_mut(usize::from(port.0)) {
             *last = Some(DroppedCommand { at: now, why, frame: place.0, field: place.1, value });
@@ -203,7 +203,7 @@ impl CommandLink {
     }
 
     fn drop_command(&mut self, command: Waiting, why: DropReason, now: Instant) {
-        self.tell(command.port, why, (command.field, command.value), now);
+        self.note_dropped(command.port, why, (command.field, command.value), now);
         self.outcomes.push(command, ReplyCode::NotSent);
     }
 
@@ -230,12 +230,12 @@ impl CommandLink {
         }
     }
 
-    /// The field's frame is overdue. [`Self::drop_forgotten`] follows.
+    /// The field's frame is overdue. [`Self::drop_commands_of_gone`] follows.
     pub(crate) fn silent(&mut self, field: u8, now: Instant) {
         self.lose_base(field, now, CommandField::silent);
     }
 
-    /// The field's device is gone. [`Self::drop_forgotten`] follows.
+    /// The field's device is gone. [`Self::drop_commands_of_gone`] follows.
     pub(crate) fn forget(&mut self, field: u8, now: Instant) {
         self.lose_base(field, now, CommandField::forget);
     }
@@ -247,7 +247,7 @@ impl CommandLink {
     }
 
     /// Drops the waiting commands of devices that are gone.
-    pub(crate) fn drop_forgotten(&mut self, now: Instant) {
+    pub(crate) fn drop_commands_of_gone(&mut self, now: Instant) {
         for _ in 0..self.queue.len() {
             let Some(waiting) = self.queue.pop_front() else { return };
             let is_there = self.fields.get(usize::from(waiting.field)).is_some_and(|f| f.last.is_some());
@@ -278,16 +278,16 @@ impl CommandLink {
                 LinkState::Up { .. },
                 Some(LinkState::Opening { .. } | LinkState::Up { .. }),
             ) => {
-                self.strike(now);
+                self.second_connection_lost(now);
             }
             (LinkId::COMMAND, LinkState::Up { .. }, Some(LinkState::Up { since }))
                 if now.saturating_since(since) <= TOGETHER =>
             {
-                self.strike(now);
+                self.second_connection_lost(now);
             }
             // Both were lost together, which says nothing about the second one.
             (LinkId::COMMAND, LinkState::Up { .. }, _) | (LinkId::URGENT, _, Some(LinkState::Up { .. })) => {
-                self.struck_at = self.struck_at.filter(|&at| now.saturating_since(at) > TOGETHER);
+                self.second_lost_at = self.second_lost_at.filter(|&at| now.saturating_since(at) > TOGETHER);
             }
             (LinkId::COMMAND, LinkState::Opening { .. }, _) => self.was_away(now),
             _ => {}
@@ -295,10 +295,10 @@ impl CommandLink {
     }
 
     /// The second connection was lost, or the first because of it.
-    fn strike(&mut self, now: Instant) {
+    fn second_connection_lost(&mut self, now: Instant) {
         let Some(urgent) = &mut self.urgent else { return };
-        let again = self.struck_at.is_some_and(|at| now.saturating_since(at) <= STRIKES_WITHIN);
-        self.struck_at = Some(now);
+        let again = self.second_lost_at.is_some_and(|at| now.saturating_since(at) <= LOST_AGAIN_WITHIN);
+        self.second_lost_at = Some(now);
         if again {
             urgent.supervisor.share(now);
             self.lost(LinkId::URGENT, now);
@@ -307,7 +307,7 @@ impl CommandLink {
 
     /// The controller was away: it may have been replaced by another one.
     fn was_away(&mut self, now: Instant) {
-        self.struck_at = None;
+        self.second_lost_at = None;
         if let Some(urgent) = &mut self.urgent {
             urgent.supervisor.unshare(now);
         }
@@ -318,7 +318,7 @@ impl CommandLink {
         let Some(session) = self.session(link) else { return };
         let [first, beside] = session.lost();
         if first.is_some() {
-            self.no_way_before(now + OPEN_AGAIN);
+            self.no_reopening_before(now + OPEN_AGAIN);
         }
         // Of two commands of the same kind the newer one is sent again, because its result is the one shown.
         for sent in [beside, first].into_iter().flatten() {
@@ -336,8 +336,8 @@ impl CommandLink {
         }
     }
 
-    fn no_way_before(&mut self, at: Instant) {
-        self.way_made_until = self.way_made_until.max(at);
+    fn no_reopening_before(&mut self, at: Instant) {
+        self.no_reopening_until = self.no_reopening_until.max(at);
     }
 
     /// The gateway itself slept: drops commands picked before. The next value picks a stop again if the device still
@@ -395,7 +395,7 @@ impl CommandLink {
                 self.lost(link, now);
             }
         }
-        if let Some((link, at)) = self.crowded()
+        if let Some((link, at)) = self.connection_to_reopen()
             && now >= at
         {
             // The peer does not reply: reopening the connection is faster than waiting.
@@ -430,7 +430,7 @@ impl CommandLink {
         if was_opening && matches!(session.supervisor.state(), LinkState::Down { .. }) {
             match link {
                 LinkId::COMMAND => self.was_away(now),
-                _ if ordinary_is_up => self.strike(now),
+                _ if ordinary_is_up => self.second_connection_lost(now),
                 _ => {}
             }
         }
@@ -438,7 +438,7 @@ impl CommandLink {
 
     /// The next urgent command that may be sent, and its connection.
     pub(crate) fn next_stop(&mut self, out: &mut [u8], now: Instant) -> Option<(LinkId, usize)> {
-        while let Some(link) = self.way_of_stops()
+        while let Some(link) = self.connection_for_stops()
             && let Some(command) = self.pop_stop(now)
         {
             if let Some(len) = self.send(link, command, out, (now, now + STOP_TTL)) {
@@ -465,7 +465,7 @@ impl CommandLink {
     }
 
     /// The connection on which an urgent command can be sent now.
-    fn way_of_stops(&self) -> Option<LinkId> {
+    fn connection_for_stops(&self) -> Option<LinkId> {
         if self.stops.is_empty() {
             return None;
         }
@@ -489,9 +489,9 @@ impl CommandLink {
 
     /// If an urgent command has waited long enough, and only for replies: the connection whose newest command has been
     /// unanswered longest, and when to give it up.
-    fn crowded(&self) -> Option<(LinkId, Instant)> {
+    fn connection_to_reopen(&self) -> Option<(LinkId, Instant)> {
         let has_room = self.ordinary.supervisor.is_up() && self.ordinary.beside.is_none();
-        if has_room || self.stops.is_empty() || self.way_of_stops().is_some() {
+        if has_room || self.stops.is_empty() || self.connection_for_stops().is_some() {
             return None;
         }
         // Nothing is in flight on a connection that is down.
@@ -499,7 +499,7 @@ impl CommandLink {
         let urgent = urgent.map(|sent| (LinkId::URGENT, sent.at));
         let ordinary = self.ordinary.beside.map(|sent| (LinkId::COMMAND, sent.at));
         let (link, at) = urgent.into_iter().chain(ordinary).min_by_key(|&(_, at)| at)?;
-        Some((link, (at + STOP_TTL).max(self.stop_may_go_at()).max(self.way_made_until)))
+        Some((link, (at + STOP_TTL).max(self.stop_may_go_at()).max(self.no_reopening_until)))
     }
 
     fn send(
@@ -557,9 +557,9 @@ impl CommandLink {
     }
 
     fn stops_deadline(&self) -> Instant {
-        let goes_at = match self.way_of_stops() {
+        let goes_at = match self.connection_for_stops() {
             Some(_) => self.stop_may_go_at(),
-            None => self.crowded().map_or(Instant::NEVER, |(_, at)| at),
+            None => self.connection_to_reopen().map_or(Instant::NEVER, |(_, at)| at),
         };
         goes_at.min(self.stops.deadline(|waiting| is_asked(&self.fields, waiting)))
     }

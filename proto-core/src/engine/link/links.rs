@@ -10,7 +10,7 @@ use super::connection::Connection;
 use super::device::DeviceLink;
 use super::modbus::ModbusLink;
 use super::other_text::OtherText;
-use super::recipe::Uplink;
+use super::recipe::RecipeLink;
 use super::state::StateLink;
 use crate::engine::clock::Dirty;
 use crate::engine::counters::{LinkCounters, add};
@@ -83,7 +83,7 @@ pub(crate) struct Links<'e> {
     pub command: &'e mut Maybe<CommandLink>,
     pub state: &'e mut Maybe<StateLink>,
     pub modbus: &'e mut Maybe<ModbusLink>,
-    pub recipes: &'e mut VecView<Uplink>,
+    pub recipes: &'e mut VecView<RecipeLink>,
     /// At most as many as recipe links.
     pub devices: &'e mut VecView<DeviceLink>,
 }
@@ -95,7 +95,7 @@ pub(crate) struct LinksView<'a> {
     pub command: Option<&'a CommandLink>,
     pub state: Option<&'a StateLink>,
     pub modbus: Option<&'a ModbusLink>,
-    pub recipes: &'a [Uplink],
+    pub recipes: &'a [RecipeLink],
     pub devices: &'a [DeviceLink],
 }
 
@@ -364,7 +364,7 @@ impl Links<'_> {
     /// The next output to the controller: commands that stop the robot, then field values, then other commands. Also
     /// returns the earliest of the link's deadlines that may have become earlier. Removes links from `ask` that have
     /// nothing to send before another event.
-    pub(crate) fn next_upward(
+    pub(crate) fn next_link_frame(
         &mut self,
         ask: &mut Dirty,
         store: &mut Store,

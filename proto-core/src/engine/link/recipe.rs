@@ -36,7 +36,7 @@ const GREET_EVERY: Duration = Duration::from_millis(500);
 const SPEAK_EVERY: Duration = Duration::from_secs(20);
 
 #[derive(Debug, Clone)]
-pub(crate) struct Uplink {
+pub(crate) struct RecipeLink {
     pub id: LinkId,
     pub kind: LinkKind,
     /// The configured name of a listening port.
@@ -72,7 +72,7 @@ pub(crate) struct Uplink {
 }
 
 /// The configuration of a recipe link, compiled.
-pub(crate) struct UplinkSetup {
+pub(crate) struct RecipeLinkSetup {
     pub id: LinkId,
     pub kind: LinkKind,
     pub name: Option<Name>,
@@ -87,9 +87,9 @@ pub(crate) struct UplinkSetup {
     pub patience: Duration,
 }
 
-impl Uplink {
+impl RecipeLink {
     pub(crate) fn new(
-        UplinkSetup { id, kind, name, transport, timings, input, output, set, writes, group, patience }: UplinkSetup,
+        RecipeLinkSetup { id, kind, name, transport, timings, input, output, set, writes, group, patience }: RecipeLinkSetup,
     ) -> Self {
         let framing = match kind {
             LinkKind::RecipeTcpListen { .. } => Framing::Bytes,
@@ -247,7 +247,7 @@ impl Uplink {
     }
 }
 
-impl Connection for Uplink {
+impl Connection for RecipeLink {
     fn opened(&mut self, store: &mut Store) {
         self.busy = false;
         self.handed_over = None;

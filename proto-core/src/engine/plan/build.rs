@@ -24,7 +24,7 @@ use crate::engine::link::command::CommandLink;
 use crate::engine::link::command_tables::MAX_COMMAND_BYTES;
 use crate::engine::link::device::DeviceLink;
 use crate::engine::link::modbus::{MAX_POLL_BLOCKS, ModbusLink};
-use crate::engine::link::recipe::{Uplink, UplinkSetup};
+use crate::engine::link::recipe::{RecipeLink, RecipeLinkSetup};
 use crate::engine::link::state::StateLink;
 use crate::engine::values::bits::{MAX_SHARES, SafeBytes};
 use crate::engine::values::counts::MAX_COUNTS;
@@ -75,7 +75,7 @@ impl EngineView<'_> {
         }
         let mut groups = Groups(self.store.frames.len() as u8);
         for (id, recipe) in uplinks(config) {
-            self.add_uplink(config, &plan, id, recipe, &mut groups)?;
+            self.add_recipe_link(config, &plan, id, recipe, &mut groups)?;
         }
         if plan.needs_state() {
             let group = groups.next().ok_or(one_too_many(Counted::Groups, MAX_GROUPS))?;
@@ -416,7 +416,7 @@ impl EngineView<'_> {
     }
 
     #[inline(never)]
-    fn add_uplink(
+    fn add_recipe_link(
         &mut self,
         config: ConfigView<'_>,
         plan: &Plan,
@@ -477,7 +477,7 @@ impl EngineView<'_> {
         // Ports whose values never expire do not count.
         let timeouts = timeouts.filter(|timeout| *timeout != Port::NEVER);
         let patience = timeouts.min().unwrap_or(PATIENCE).max(PATIENCE);
-        let uplink = Uplink::new(UplinkSetup {
+        let uplink = RecipeLink::new(RecipeLinkSetup {
             id,
             kind,
             name: id

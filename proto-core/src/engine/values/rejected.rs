@@ -1,7 +1,7 @@
 //! Frames with rejected fields: their variables change groups.
 
 use super::store::Store;
-use super::withheld::{FieldSet, WAITING, group_of, members};
+use super::withheld::{FieldSet, OWN_GROUPS, group_of, members};
 use crate::image::GroupId;
 use crate::time::{Instant, Stamp};
 
@@ -57,7 +57,7 @@ impl Store {
                 *group = 0;
             }
         }
-        for nth in 0..WAITING {
+        for nth in 0..OWN_GROUPS {
             let group = group_of(nth);
             let is_empty = members(&self.image, group).is_empty()
                 && self.bits.withheld_groups().chain(self.withheld.command_groups()).all(|own| own != group);

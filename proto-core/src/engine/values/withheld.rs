@@ -14,11 +14,11 @@ use crate::time::{Instant, Stamp};
 pub(crate) const MAX_COMMAND_FIELDS: usize = 16;
 
 /// Number of groups for fields that are not overdue yet.
-pub(super) const WAITING: usize = WITHHELD_GROUPS - 2;
+pub(super) const OWN_GROUPS: usize = WITHHELD_GROUPS - 2;
 /// The group of overdue fields whose own group was reused: as old as the oldest of them.
-const LONG_AGO: GroupId = group_of(WAITING);
-/// Like `LONG_AGO`, for fields that never had a value.
-const UNKNOWN: GroupId = group_of(WAITING + 1);
+const OVERDUE_GROUP: GroupId = group_of(OWN_GROUPS);
+/// Like `OVERDUE_GROUP`, for fields that never had a value.
+const NO_VALUE_GROUP: GroupId = group_of(OWN_GROUPS + 1);
 
 pub(super) const fn group_of(nth: usize) -> GroupId {
     GroupId(MAX_GROUPS.saturating_add(nth) as u8)
@@ -55,9 +55,9 @@ impl FieldSet {
 #[derive(Debug, Clone)]
 pub(crate) struct Withheld {
     /// When each group is overdue; [`Instant::NEVER`] once it is.
-    pub(super) overdue_at: [Stamp; WAITING],
+    pub(super) overdue_at: [Stamp; OWN_GROUPS],
     /// The frame of each group, by its index in the store.
-    pub(super) frames: [u8; WAITING],
+    pub(super) frames: [u8; OWN_GROUPS],
     /// For each command field, one more than the number of its group while it is rejected, else 0.
     pub(super) commands: [u8; MAX_COMMAND_FIELDS],
     /// Whether any field is rejected.
@@ -67,8 +67,8 @@ pub(crate) struct Withheld {
 impl Withheld {
     pub(crate) const fn new() -> Self {
         Self {
-            overdue_at: [Stamp::NEVER; WAITING],
-            frames: [0; WAITING],
+            overdue_at: [Stamp::NEVER; OWN_GROUPS],
+            frames: [0; OWN_GROUPS],
             commands: [0; MAX_COMMAND_FIELDS],
             is_used: false,
         }
@@ -122,7 +122,7 @@ impl Withheld {
         image: &mut Image,
         bits: &mut Bits,
     ) -> Option<GroupId> {
-        let mut used = [false; WAITING];
+        let mut used = [false; OWN_GROUPS];
         let in_use = image.withheld().iter().filter_map(|var| image.group(var)).chain(bits.withheld_groups());
         for group in in_use.chain(self.command_groups()) {
             if let Some(is_used) = place_of(group).and_then(|nth| used.get_mut(nth)) {
@@ -145,7 +145,7 @@ impl Withheld {
                 let over = all().filter(|(((_, at), _), _)| *at == Stamp::NEVER);
                 let over = over.map(|(((group, _), _), _)| (image.stamp_of(group), group));
                 let (stamp, group) = over.min_by_key(|(stamp, _)| stamp.unwrap_or(Instant::ZERO))?;
-                let bin = if stamp.is_some() { LONG_AGO } else { UNKNOWN };
+                let bin = if stamp.is_some() { OVERDUE_GROUP } else { NO_VALUE_GROUP };
                 if let Some(at) = stamp {
                     let is_empty =
                         members(image, bin).is_empty() && bits.withheld_groups().all(|own| own != bin);
