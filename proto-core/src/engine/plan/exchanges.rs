@@ -268,26 +268,8 @@ impl EngineView<'_> {
                     peer
                 }
             };
-            let on_line = |len: usize| line_of.map_or(Duration::ZERO, |line| line.time_on_line(len));
-            let cost = on_line(request_len) + exchange.timeout + exchange.pause;
-            let kind = RowKind {
-                is_answered: exchange.is_answered(),
-                starts: exchange.when.start,
-                is_state: !exchange.is_start_event()
-                    && (!exchange.is_event()
-                        || exchange.when.every.is_some()
-                        || exchange.when.change
-                        || exchange.when.start),
-                stops: exchange.stop,
-                retries: [exchange.retries, exchange.event_retries],
-            };
-            let pause = match item.asks {
-                // A broadcast has no reply, so the slaves get time to execute it.
-                Asks::Rtu { slave: BROADCAST, .. } => exchange.pause + Timing::TURNAROUND,
-                _ => exchange.pause,
-            };
-            let times = Times { cost, timeout: exchange.timeout, late: exchange.late(), pause };
-            let mut row = Row::new(peer as u8, kind, exchange.when.every, times);
+            let on_line = line_of.map_or(Duration::ZERO, |line| line.time_on_line(request_len));
+            let mut row = row_of(exchange, item.asks, peer as u8, on_line);
             // Over TCP, the transaction id distinguishes all replies.
             row.alike = if is_tcp { 0 } else { config.waits_for(recipe, exchange) };
             self.exchanges.rows.push(row).map_err(|_| full())?;
@@ -304,6 +286,30 @@ impl EngineView<'_> {
         line.transactions = is_tcp.then(Transactions::new);
         Ok(line)
     }
+}
+
+/// The row of an exchange whose request takes this time on the line.
+fn row_of(exchange: &Exchange, asks: Asks, peer: u8, on_line: Duration) -> Row {
+    let when = &exchange.when;
+    let kind = RowKind {
+        is_answered: exchange.is_answered(),
+        starts: when.start,
+        is_state: !exchange.is_start_event()
+            && (!exchange.is_event() || when.every.is_some() || when.change || when.start),
+        stops: exchange.stop,
+        retries: [exchange.retries, exchange.event_retries],
+    };
+    let times = Times {
+        cost: on_line + exchange.timeout + exchange.pause,
+        timeout: exchange.timeout,
+        late: exchange.late(),
+        pause: match asks {
+            // A broadcast has no reply, so the slaves get time to execute it.
+            Asks::Rtu { slave: BROADCAST, .. } => exchange.pause + Timing::TURNAROUND,
+            _ => exchange.pause,
+        },
+    };
+    Row::new(peer, kind, when.every, times)
 }
 
 /// The previous exchange of the same peer that the same bit triggers: together they are steps of one event.
