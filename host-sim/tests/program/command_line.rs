@@ -266,3 +266,20 @@ fn the_help_teaches() {
     }
     assert!(ok(&["--help"], "").contains("Exit codes:"));
 }
+
+#[test]
+fn help_of_all_commands() {
+    let mut waiting = vec![vec![]];
+    let mut all = String::new();
+    while let Some(command) = waiting.pop() {
+        let help = ok(&[&command[..], &["--help"]].concat(), "");
+        let commands = help.split_once("\nCommands:\n").map_or("", |(_, behind)| behind);
+        let commands =
+            commands.lines().map_while(|line| line.split_whitespace().next().map(|name| (line, name)));
+        let commands = commands.filter(|(line, name)| !line.starts_with("   ") && *name != "help");
+        let names: Vec<&str> = commands.map(|(_, name)| &*name.to_owned().leak()).collect();
+        waiting.extend(names.iter().rev().map(|name| [&command[..], &[name]].concat()));
+        all += &format!("$ host-sim {} --help\n{help}\n", command.join(" "));
+    }
+    insta::assert_snapshot!("help", all.replace("host-sim  --help", "host-sim --help"));
+}
