@@ -22,18 +22,29 @@ pub(crate) fn all() -> Vec<Scenario> {
     ]
 }
 
-/// A robot whose programs pulse two bits, with a target that is allowed and one that is not.
+/// A robot whose programs pulse two bits until an event has ended, with a target that is allowed and one that is not. A
+/// gateway that lags misses a shorter pulse.
 const ROBOT: &str = r#"
 [initial]
 "WordOutputReg[1]" = 1200
 
 [[program]]
 name = "pulse.jspf"
-script = 'set("BitOutputReg[3]", 3); wait_ms(500); set("BitOutputReg[3]", 0); wait_ms(500);'
+script = '''
+let ended = get("WordInputReg[3]");
+set("BitOutputReg[3]", 3);
+while get("WordInputReg[3]") == ended { wait_ms(100); }
+set("BitOutputReg[3]", 0);
+wait_ms(1000);
+'''
 
 [[program]]
 name = "wrong.jspf"
-script = 'set("WordOutputReg[1]", 9000); set("BitOutputReg[3]", 3); wait_ms(500); set("BitOutputReg[3]", 0); wait_ms(500); set("WordOutputReg[1]", 1300);'
+script = '''
+set("WordOutputReg[1]", 9000);
+call("pulse.jspf");
+set("WordOutputReg[1]", 1300);
+'''
 "#;
 
 /// A bit of the robot starts an axis, which is switched on once; its position is read.
