@@ -1,10 +1,11 @@
 //! A recording of all inputs and outputs of the cell's engine, in the format of `proto_core::record`, to
 //! be replayed on another machine (docs/cortex-m7.md section 1).
 
-use proto_core::config::{GatewayConfig, image};
+use proto_core::config::GatewayConfig;
 use proto_core::engine::{Engine, Input, Output};
 use proto_core::record::{Entry, MAGIC, totals};
 use proto_core::time::Instant;
+use recipe_config::board::image_of;
 
 /// A recording in the making.
 #[derive(Debug)]
@@ -16,10 +17,8 @@ pub(super) struct Recorder {
 impl Recorder {
     /// A recording of an engine with this configuration.
     pub(super) fn new(config: &GatewayConfig) -> Self {
-        let mut buffer = vec![0; image::MAX_IMAGE];
-        let len = image::encode(config, &mut buffer).expect("the buffer fits every configuration");
-        buffer.truncate(len);
-        let mut recorder = Self { image: buffer, bytes: MAGIC.to_vec() };
+        let image = image_of(config).expect("it was checked");
+        let mut recorder = Self { image, bytes: MAGIC.to_vec() };
         recorder.start();
         recorder
     }

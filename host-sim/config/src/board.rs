@@ -6,8 +6,21 @@
 use std::fmt;
 use std::str::FromStr;
 
-use proto_core::config::{Bus, GatewayConfig};
+use proto_core::config::{Bus, GatewayConfig, image};
 use proto_core::engine::Engine;
+
+/// The image of a configuration (docs/configuration.md section 6), which this program has decoded again: what a board
+/// would refuse is never stored or sent.
+///
+/// # Errors
+/// The text for people: it is longer than [`image::MAX_IMAGE`], or a board would refuse it.
+pub fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
+    let mut bytes = vec![0; image::MAX_IMAGE];
+    let len = image::encode(config, &mut bytes).map_err(|error| error.to_string())?;
+    bytes.truncate(len);
+    image::decode(&bytes).map_err(|error| error.to_string())?;
+    Ok(bytes)
+}
 
 /// A board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

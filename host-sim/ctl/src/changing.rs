@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use proto_core::config::{GatewayConfig, MAX_PORTS, image};
 use proto_core::engine::Engine;
 use recipe_api::key::Hex;
-use recipe_config::board::Board;
+use recipe_config::board::{Board, image_of};
 use recipe_config::file::{self, FileError};
 use serde_json::{Value, json};
 
@@ -89,15 +89,6 @@ impl Configuration {
 
 fn is_this_machine(address: &str) -> bool {
     address == "localhost" || address.parse::<IpAddr>().is_ok_and(|ip| ip.to_canonical().is_loopback())
-}
-
-fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
-    let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(config, &mut bytes).map_err(|error| error.to_string())?;
-    bytes.truncate(len);
-    // What a board would refuse is never sent.
-    image::decode(&bytes).map_err(|error| error.to_string())?;
-    Ok(bytes)
 }
 
 /// What takes a configuration.

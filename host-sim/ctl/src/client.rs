@@ -247,7 +247,7 @@ impl Client {
         let reply = self.asked_again(&call, || Ok(self.send(&call, None)?.finish()?))?;
         let document = self.document(&self.accepted(reply)?)?;
         let nonce = document["nonce"].as_str().and_then(fit_nonce);
-        nonce.ok_or_else(|| self.refused("its nonce is none; is this a gateway?"))
+        nonce.ok_or_else(|| self.refused("its reply has no nonce; is this a gateway?"))
     }
 
     fn send(&self, call: &Call<'_>, nonce: Option<&str>) -> Result<HttpExchange, Missed> {

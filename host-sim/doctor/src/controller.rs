@@ -71,7 +71,7 @@ fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
                 format!("no reply to {given}{when}"),
                 "a reply from the command port",
                 "The connection was lost, or the controller is busy or hangs",
-                "Look at the controller's own log; the command may have been carried out",
+                "Look at the controller's own log; the command may have been executed",
             ))
         }
         ReplyCode::NotSent => {

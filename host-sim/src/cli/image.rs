@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use proto_core::config::image;
-use recipe_config::board::Board;
+use recipe_config::board::{Board, image_of};
 
 use super::output::OutputFile;
 use super::{CliResult, Overrides, check};
@@ -33,14 +33,11 @@ pub(super) fn run(args: &ImageArgs, out: &mut dyn Write) -> CliResult {
     let config = check::load_gateway(&args.file, &args.overrides.set).map_err(|error| error.to_string())?;
     check::check_board(&args.file, &args.overrides.set, &config, args.board)
         .map_err(|error| error.to_string())?;
-    let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(&*config, &mut bytes).map_err(|error| error.to_string())?;
-    bytes.truncate(len);
-    // An image that a board would refuse is never written.
-    image::decode(&bytes).map_err(|error| error.to_string())?;
+    let bytes = image_of(&config)?;
     let name = args.output.display();
     write(args, &bytes).map_err(|error| format!("{name}: {error}"))?;
-    writeln!(out, "{name}: {len} bytes, version {}", image::VERSION).map_err(|error| error.to_string())
+    writeln!(out, "{name}: {} bytes, version {}", bytes.len(), image::VERSION)
+        .map_err(|error| error.to_string())
 }
 
 /// Writes the image unless that would replace another file.

@@ -228,7 +228,7 @@ pub(super) fn busy(buf: &mut [u8]) -> Reply {
 }
 
 pub(super) fn nothing_kept(buf: &mut [u8]) -> Reply {
-    Reply::error(buf, StatusCode::UNAVAILABLE, "this board has no store, so it keeps nothing")
+    Reply::error(buf, StatusCode::UNAVAILABLE, "this board has no store; it cannot keep changes")
 }
 
 #[cfg(test)]

@@ -120,6 +120,6 @@ fn a_nonce_cannot_add_to_a_request() {
         _ => ok(&json!({})),
     });
     let error = recipe_ctl::confirm(&server.client(true)).unwrap_err();
-    assert!(error.message().contains("its nonce is none"), "{error:?}");
+    assert!(error.message().contains("has no nonce"), "{error:?}");
     assert_eq!(server.paths(), ["GET nonce"]);
 }

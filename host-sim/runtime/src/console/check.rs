@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
-use proto_core::config::{GatewayConfig, MAX_PORTS, image};
+use proto_core::config::{GatewayConfig, MAX_PORTS};
 use proto_core::engine::Engine;
 use recipe_capture::Decoder;
 use recipe_config::SimConfig;
+use recipe_config::board::image_of;
 use recipe_config::file::{self, Config, FileError, Source, Text};
 use recipe_controller::Controller;
 use recipe_export::Model;
@@ -38,12 +39,7 @@ pub(super) fn gateway(
 /// The image of a gateway's text, as `host-sim image` makes it.
 pub(super) fn image(toml: &str) -> Result<Vec<u8>, Box<Mistake>> {
     let config = gateway(NAME, toml, &[])?;
-    let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(&*config, &mut bytes).map_err(|error| Mistake::of_whole(&error))?;
-    bytes.truncate(len);
-    // An image that a board would refuse is never given out.
-    image::decode(&bytes).map_err(|error| Mistake::of_whole(&error))?;
-    Ok(bytes)
+    image_of(&config).map_err(|error| Mistake::of_whole(&error))
 }
 
 fn has_room(config: &GatewayConfig) -> Result<(), Box<Mistake>> {

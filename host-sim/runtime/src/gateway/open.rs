@@ -6,10 +6,11 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig, image};
+use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
 use proto_core::engine::{Endpoint as To, LinkKind, PortId, Transport};
 use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
+use recipe_config::board::image_of;
 use serde_json::json;
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
@@ -147,16 +148,9 @@ fn begin_tapping(
     let at = now();
     let cell = Watched::new(config, engine, Epoch { at, wall: SystemTime::now() }, Arc::clone(decoder));
     // Only recordings start with the image; a long configuration has none.
-    let image = watch.wanted().passes.then(|| encoded(config)).transpose()?;
+    let image = watch.wanted().passes.then(|| image_of(config)).transpose().map_err(RunError::new)?;
     Tapping::begin(watch, cell, at, image.as_deref())
         .map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
-}
-
-fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, RunError> {
-    let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(config, &mut bytes).map_err(|error| RunError::new(error.to_string()))?;
-    bytes.truncate(len);
-    Ok(bytes)
 }
 
 async fn open_port(
