@@ -410,7 +410,7 @@ fn a_line_that_is_full_and_a_timeout_that_is_short_are_told() {
 }
 
 #[test]
-fn a_conversation_on_can_takes_its_frames() {
+fn an_exchange_on_can_takes_its_frames() {
     let config = with(&[ExchangeBuilder::request(ExchangeFrame::remote(CanId::Standard(1)))
         .reply(ExchangeFrame::can(
             CanId::Standard(1),

@@ -525,7 +525,7 @@ pub(crate) fn seeds() -> Vec<Vec<u8>> {
     seeds
 }
 
-/// Each kind of recipe several times, with a conversation on its port.
+/// Each kind of recipe several times, with exchanges on its port.
 fn device_seeds() -> Vec<Vec<u8>> {
     let mut random = Random::new(7);
     let mut seeds = Vec::new();

@@ -1,4 +1,4 @@
-//! Conversations with frames of a device's own, on lines and on CAN.
+//! Exchanges with frames of a device's own, on lines and on CAN.
 
 use proto_core::config::*;
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Encoding, Overflow};

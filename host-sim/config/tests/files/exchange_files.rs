@@ -168,7 +168,7 @@ fn a_slave_serves_its_blocks() {
 }
 
 #[test]
-fn a_conversation_has_frames_of_its_own() {
+fn an_exchange_has_frames_of_its_own() {
     let config = line();
     let talk = exchanges(&config, 2);
     assert_eq!((talk[0].peer, talk[0].when), (3, Triggers::every(ms(50))));

@@ -133,16 +133,16 @@ fn documented(part: &str) -> (String, String) {
     let (_, text) = document.split_once(&format!("\n### {part}\n")).unwrap();
     let text = text.split("\n## ").next().unwrap().split("\n### ").next().unwrap();
     // Those behind the first one of this part are of Modbus.
-    let count = if part == "Conversations" { 1 } else { usize::MAX };
+    let count = if part == "Exchanges" { 1 } else { usize::MAX };
     let blocks: Vec<_> = text.split("```\n").skip(1).step_by(2).take(count).collect();
     (blocks.concat(), text.to_owned())
 }
 
 #[test]
-fn the_worked_bytes_of_conversations_are_right() {
+fn the_worked_bytes_of_exchanges_are_right() {
     for (title, recipe, frames) in [
         (
-            "Conversations",
+            "Exchanges",
             "[[recipe]]\nname = \"r\"\nkind = \"stream\"\nmode = \"user\"\n",
             &[(1, ExchangePart::Request, ""), (1, ExchangePart::Reply, "1000")][..],
         ),

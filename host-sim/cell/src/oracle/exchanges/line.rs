@@ -1,5 +1,5 @@
 //! The exchanges of one line or bus: the request on its way, its reply, and who is asked when
-//! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Conversations").
+//! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Exchanges").
 //!
 //! It does not predict which request is next: it says which ones may be sent, which must not, and how
 //! long none may be.

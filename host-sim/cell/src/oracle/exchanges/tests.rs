@@ -1,4 +1,4 @@
-//! Devices and gateways that break what is promised of conversations: the model reports it.
+//! Devices and gateways that break what is promised of exchanges: the model reports it.
 
 use std::collections::VecDeque;
 

@@ -1,4 +1,4 @@
-//! Exchanges of a device's own frames (docs/configuration.md section 4, "Conversations"): the request, what
+//! Exchanges of a device's own frames (docs/configuration.md section 4, "Exchanges"): the request, what
 //! answers it, and which bytes are which.
 //!
 //! Written from that page, independent of the engine's exchanges.
