@@ -24,16 +24,16 @@ use report::{CheckReport, MessageReport, Refusal};
 pub(super) struct CheckArgs {
     /// A gateway file or a controller file
     file: PathBuf,
-    /// Print JSON, of mistakes too (docs/checking.md)
+    /// Print the report or the error as JSON (docs/checking.md)
     #[arg(long)]
     json: bool,
-    /// Whether this board can run it: nucleo-h743zi or mps2-an500
+    /// Also check that this board can run it: nucleo-h743zi or mps2-an500
     #[arg(long, value_name = "BOARD")]
     board: Option<Board>,
-    /// CAN ports of the file that are on one bus
+    /// CAN ports of the file that share one bus, such as can-1,can-2; repeatable
     #[arg(long, value_name = "PORT,PORT", value_parser = names)]
     same_bus: Vec<PortNames>,
-    /// Also print what the file means now and did not mean in this version
+    /// Also print what the file means now but did not mean in this version
     #[arg(long, value_name = "VERSION")]
     since: Option<Version>,
     #[command(flatten)]

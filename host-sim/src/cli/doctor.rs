@@ -18,12 +18,12 @@ use super::run::parse_time;
 use super::{Out, Overrides, check, wrong};
 
 pub(super) const EXAMPLES: &str = "\
-The controller is given nothing: no value, no command, no frame. Its state stream is
+Nothing is sent to the controller: no value, no command, no frame. Its state stream is
 read; its other TCP ports are connected to and closed at once. Its UDP server is not
-tried: that would take a frame. End the gateway first: devices have one owner.
+tested: that would take a frame. Stop the gateway first: a device has one owner.
 
-Nothing is sent to the field either. Devices that must be asked, such as Modbus slaves,
-stay silent then; --ask sends what the file says on ports with exchanges, writes too.
+Nothing is sent to the field either, so devices that only reply, such as Modbus slaves,
+stay silent. --ask sends the requests of the file's exchanges, writes included.
 
 Examples:
   host-sim doctor -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
@@ -32,10 +32,10 @@ Examples:
   host-sim gateway -v -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
                                                  the same findings, while the gateway runs
 
-docs/trouble.md has each symptom with its cause and remedy.
+docs/trouble.md lists symptoms, causes and remedies.
 
-Exit codes: 0 nothing found, 1 something found, 2 a file or an argument is wrong and
-nothing was started.";
+Exit codes: 0 nothing found, or notes only; 1 something found; 2 a file or an argument
+is invalid and nothing was started.";
 
 /// Arguments of `doctor`.
 #[derive(Debug, Args)]
@@ -48,13 +48,13 @@ pub(super) struct DoctorArgs {
     /// Bind a port to a device, as for `gateway`
     #[arg(long, value_name = "NAME=DEVICE")]
     bind: Vec<Bind>,
-    /// How long to listen, such as 5s or 1m; devices that speak rarely need longer
+    /// How long to listen, such as 5s or 1m; longer for devices that send rarely
     #[arg(long = "for", value_name = "TIME", default_value = "6s", value_parser = parse_time)]
     time: Duration,
-    /// Send the requests of ports with exchanges, as the gateway does: a device may move
+    /// Send the requests of exchanges, as the gateway does: a device may move
     #[arg(long)]
     ask: bool,
-    /// Print a JSON array of findings
+    /// Print the findings as a JSON array
     #[arg(long)]
     json: bool,
 }

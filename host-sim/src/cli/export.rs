@@ -23,16 +23,16 @@ pub(super) struct ExportArgs {
 
 #[derive(Debug, Subcommand)]
 enum ExportCommand {
-    /// A CAN database (DBC) of the file's CAN ports
+    /// Write a CAN database (DBC) of the file's CAN ports
     #[command(after_help = DBC_EXAMPLES)]
     Dbc(DbcArgs),
-    /// A dissector in Lua for Wireshark and tshark
+    /// Write a Lua dissector for Wireshark and tshark
     #[command(after_help = LUA_EXAMPLES)]
     Lua(FileArgs),
-    /// A table of all variables: who writes them, in which bytes of which frame
+    /// Write a table of all variables: who writes them, in which bytes of which frame
     #[command(after_help = MAP_EXAMPLES)]
     Map(MapArgs),
-    /// The JSON Schema of a kind of file, for editors and linters
+    /// Write the JSON Schema of a kind of file, for editors and linters
     #[command(after_help = SCHEMA_EXAMPLES)]
     Schema {
         /// The kind of file
@@ -51,7 +51,7 @@ enum ExportKind {
 struct DbcArgs {
     #[command(flatten)]
     file: FileArgs,
-    /// Only the frames of this port; without it, those of all CAN ports
+    /// Only the frames of this port [default: all CAN ports]
     #[arg(long, value_name = "NAME")]
     port: Option<String>,
 }
@@ -60,7 +60,7 @@ struct DbcArgs {
 struct MapArgs {
     #[command(flatten)]
     file: FileArgs,
-    /// How the table is written
+    /// Format of the table
     #[arg(long, default_value = "markdown")]
     format: MapFormat,
 }
@@ -79,7 +79,7 @@ struct FileArgs {
     /// Write to this file instead of to stdout
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
-    /// Replace a file that exists; never the input file
+    /// Replace an existing file; never the input file
     #[arg(long, requires = "output")]
     force: bool,
     #[command(flatten)]
@@ -102,8 +102,8 @@ Examples:
   candump -L can0 | cantools decode cell.dbc
   host-sim export dbc cell.toml --port hand
 
-Signals have the values on the bus, as `decode` shows them; what becomes of them is
-in the comments. If two ports have different frames with one id, choose one.";
+Signals are the values on the bus, as `decode` shows them; comments say what becomes
+of them. If two ports have different frames with one id, choose one with --port.";
 
 const LUA_EXAMPLES: &str = "\
 Examples:
@@ -111,7 +111,7 @@ Examples:
   tshark -X lua_script:cell.lua -r cell.pcapng -V
   cp cell.lua ~/.local/lib/wireshark/plugins/
 
-It shows serial frames in captures of `host-sim gateway --capture` and CAN frames in
+It decodes serial frames in captures of `host-sim gateway --capture`, and CAN frames in
 any capture.";
 
 const MAP_EXAMPLES: &str = "\
@@ -120,14 +120,14 @@ Examples:
   host-sim export map cell.toml --format csv -o cell.csv";
 
 const SCHEMA_EXAMPLES: &str = "\
-The schema is of draft 7. It knows keys, types, words and ranges; names of recipes,
-owners of variables and sizes of frames are known to `host-sim check` only.
+JSON Schema draft 7. It covers keys, types, words and ranges; names of recipes, owners
+of variables and sizes of frames are checked by `host-sim check` only.
 
 Examples:
   host-sim export schema > gateway.schema.json
   host-sim export schema controller > controller.schema.json
 
-An editor with tombi or taplo takes it from the first line of a file:
+Editors with tombi or taplo find it by the first line of a file:
   #:schema ./gateway.schema.json";
 
 pub(super) fn run(args: &ExportArgs, out: &mut dyn Write) -> CliResult {

@@ -29,37 +29,38 @@ pub(super) struct ExtcapArgs {
     /// List the options of an interface
     #[arg(long, group = "what", requires = "extcap_interface")]
     extcap_config: bool,
-    /// Capture into a pipe until that is closed
+    /// Capture into --fifo until that is closed
     #[arg(long, group = "what", requires = "extcap_interface", requires = "fifo")]
     capture: bool,
-    /// The interface
+    /// The interface: rgw
     #[arg(long, value_name = "NAME")]
     extcap_interface: Option<String>,
     /// Wireshark's version
     #[arg(long, value_name = "VERSION", num_args = 0..=1)]
     extcap_version: Option<Option<String>>,
-    /// Wireshark's capture filter, which is not used
+    /// Wireshark's capture filter; ignored
     #[arg(long, value_name = "FILTER")]
     extcap_capture_filter: Option<String>,
-    /// Wireshark's pipe
+    /// The pipe to write the capture to
     #[arg(long, value_name = "FILE")]
     fifo: Option<PathBuf>,
-    /// The gateway's ready file; without it, the one that RGW_READY names
+    /// The gateway's ready file [env: RGW_READY]
     #[arg(long, value_name = "FILE")]
     ready: Option<PathBuf>,
-    /// Only this port
+    /// Only frames of this port
     #[arg(long, value_name = "NAME")]
     port: Option<String>,
 }
 
 pub(super) const EXAMPLES: &str = "\
-Wireshark starts it. Once, so that it is found:
+Wireshark runs this command. Install it once:
   ln -s \"$(command -v host-sim)\" ~/.local/lib/wireshark/extcap/host-sim-extcap
-Then start the gateway with its API, and tell where its ready file is:
-  host-sim gateway -c cell.toml --bind hand=socketcan:can0 --console 127.0.0.1:0 --ready run/ready.json
+Then start the gateway with its API, and name its ready file:
+  host-sim gateway -c cell.toml --bind hand=socketcan:can0 --console 127.0.0.1:0 \\
+      --ready run/ready.json
   RGW_READY=run/ready.json wireshark
 
-Examples, as Wireshark does it:
+Examples, as Wireshark runs it:
   host-sim extcap --extcap-interfaces
   host-sim extcap --capture --extcap-interface rgw --fifo PIPE --ready run/ready.json";
 

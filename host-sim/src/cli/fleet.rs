@@ -21,33 +21,34 @@ Examples:
   host-sim fleet --gateways 1000 --broker 127.0.0.1:1883 --time 60s
   host-sim fleet --gateways 200 --broker broker.plant.example:8883 --ca ca.pem --login fleet.login
 
-Each node is told of as a gateway with two field ports: births of the node and its
-devices, data by exception, death. Once a second a line with what all nodes together
-did in that second. They are the nodes node-1, node-2 and so on of the group.
+The nodes node-1, node-2 and so on publish what a gateway with two field ports does:
+births of the node and its devices, data by exception, death. Each second a line shows
+what all nodes together did in that second.
+
 Exit code 1 if a node was not online at the end.";
 
 /// Arguments of `fleet`.
 #[derive(Debug, Args)]
 pub(super) struct FleetArgs {
-    /// Number of nodes
+    /// Number of nodes, 1 to 20000
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=20_000))]
     gateways: u32,
-    /// The broker
+    /// The MQTT broker
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_broker)]
     broker: (String, u16),
-    /// TLS, with the authorities in this file (PEM) and no others
+    /// Use TLS, and trust only the certificate authorities in this file (PEM)
     #[arg(long, value_name = "FILE")]
     ca: Option<PathBuf>,
-    /// The file with two lines, user and password, that nobody else can read
+    /// File with two lines, user and password; only its owner may read it
     #[arg(long, value_name = "FILE")]
     login: Option<PathBuf>,
-    /// The group of the nodes
+    /// Sparkplug group of the nodes
     #[arg(long, value_name = "NAME", default_value = "fleet", value_parser = parse_group)]
     group: Id,
-    /// How long
+    /// How long to run, such as 90s or 5m
     #[arg(long, value_name = "TIME", default_value = "30s", value_parser = parse_time)]
     time: Duration,
-    /// How often each node has new values; one in four changes
+    /// How often each node gets new values, of which one in four changes
     #[arg(long, value_name = "TIME", default_value = "1s", value_parser = parse_time)]
     period: Duration,
 }

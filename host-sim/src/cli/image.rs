@@ -16,13 +16,13 @@ use super::{CliResult, Overrides, check};
 pub(super) struct ImageArgs {
     /// A gateway file
     file: PathBuf,
-    /// Where to write the image; an older image is replaced
+    /// The image to write; an older image is replaced
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Replace a file even if it is no image; never the input file
+    /// Replace even a file that is not an image; never the input file
     #[arg(long)]
     force: bool,
-    /// The board that is to run it, nucleo-h743zi or mps2-an500: what it has not is refused here
+    /// Refuse what this board cannot run: nucleo-h743zi or mps2-an500
     #[arg(long, value_name = "BOARD")]
     board: Option<Board>,
     #[command(flatten)]

@@ -64,64 +64,64 @@ Examples:
   host-sim                                       the demo
   host-sim new --device robotiq-ft300 -o cell.toml
                                                  a gateway file for a known device
-  host-sim check cell.toml                       check the file; what to set on the pendant
+  host-sim check cell.toml                       check the file; see what to set on the pendant
   host-sim controller -c robot.toml --bind rs485=pty:run/rs485
   host-sim pendant --ready run/ready.json set DI[3]=1
                                                  act on the controller while it runs
   host-sim gateway -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
   host-sim doctor -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
                                                  why does it not work?
-  host-sim ctl --to 192.168.0.20 status          ask a gateway that runs
+  host-sim ctl --to 192.168.0.20 status          query a running gateway
   host-sim encode cell.toml --part input 1       the frame that switches DO1 on
   host-sim decode cell.toml --part input FF FF 01 EE EE
 
 Exit codes: 0 done, 1 a run failed or its output could not be written, 2 a file or
-an argument is wrong and nothing was started.";
+an argument is invalid and nothing was started.";
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Run a whole cell in one process and check the six worked examples, or a living cell with its pages
+    /// Run a whole cell in one process: check the six worked examples, or with --console serve it to a browser
     #[command(after_help = DEMO_EXAMPLES)]
     Demo {
-        /// Run a cell until it is ended, with the gateway's page at this address and the controller's at the
-        /// next port; port 0: any
+        /// Run a cell until Ctrl-C, with the gateway's page at this address and the controller's at the next
+        /// port; port 0: any free ports; without an address 127.0.0.1:8480
         #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8480")]
         console: Option<SocketAddr>,
     },
     /// Run the simulated controller
     #[command(after_help = CONTROLLER_EXAMPLES)]
     Controller(run::ControllerRun),
-    /// Run the gateway
+    /// Run the gateway between field devices and the controller
     #[command(after_help = GATEWAY_EXAMPLES)]
     Gateway(run::GatewayRun),
-    /// Listen for some seconds and say what is wrong: ports, devices, links, the controller's mode
+    /// Listen for a few seconds and report what is wrong with ports, devices, links and the controller's mode
     #[command(after_help = doctor::EXAMPLES)]
     Doctor(doctor::DoctorArgs),
-    /// Ask and change running gateways, on hosts and boards: state, frames, another configuration
+    /// Query and change running gateways, on hosts and boards: state, frames, configuration, firmware
     #[command(after_help = ctl::EXAMPLES)]
     Ctl(ctl::CtlArgs),
-    /// Act on a running controller: press its buttons, set inputs, begin faults, watch its state
+    /// Operate a running simulated controller: press buttons, set inputs, inject faults, watch its state
     #[command(after_help = pendant::EXAMPLES)]
     Pendant(pendant::PendantArgs),
     /// List known field devices; print or write a gateway file for one
     #[command(after_help = new::EXAMPLES)]
     New(new::NewArgs),
-    /// Check a file; print the bus budget, the way of each variable and what to set on the pendant
+    /// Check a file; print the bus load, the route of each variable and what to set on the pendant
     #[command(after_help = CHECK_EXAMPLES)]
     Check(check::CheckArgs),
-    /// Write the configuration image for a board
+    /// Compile a gateway file to the configuration image that a board reads
     #[command(after_help = IMAGE_EXAMPLES)]
     Image(image::ImageArgs),
-    /// Write what other tools read: a CAN database, a dissector for Wireshark, a map, a JSON Schema
+    /// Write files for other tools: a CAN database, a Wireshark dissector, a table of variables, a JSON Schema
     #[command(after_help = export::EXAMPLES)]
     Export(export::ExportArgs),
-    /// Be an interface of Wireshark: a running gateway
+    /// Let Wireshark capture from a running gateway (extcap)
     #[command(after_help = extcap::EXAMPLES)]
     Extcap(extcap::ExtcapArgs),
-    /// Run many simulated edge nodes against a broker, and print what they do
+    /// Run many simulated Sparkplug edge nodes against an MQTT broker, and print what they do
     #[command(after_help = fleet::EXAMPLES)]
     Fleet(fleet::FleetArgs),
-    /// Run the engine of a recorded gateway again, in virtual time, and compare what it does
+    /// Replay a recorded run through the gateway's engine, in virtual time, and compare the outputs
     #[command(after_help = replay::EXAMPLES)]
     Replay(replay::ReplayArgs),
     /// Run cells in virtual time with injected faults, and check everything that the gateway does
@@ -133,7 +133,7 @@ enum Command {
     /// Decode frames to values
     #[command(after_help = DECODE_EXAMPLES)]
     Decode(DecodeArgs),
-    /// Print the completions for a shell
+    /// Print the completion script for a shell
     #[command(after_help = COMPLETIONS_EXAMPLES)]
     Completions {
         /// The shell
@@ -144,9 +144,9 @@ enum Command {
 const DEMO_EXAMPLES: &str = "\
 Examples:
   host-sim demo              the six worked examples: PASS or FAIL for each
-  host-sim demo --console    a living cell, to be watched and changed in a browser
+  host-sim demo --console    a running cell to watch and change in a browser
 
-Exit code 0 only if all examples pass. Ctrl-C ends it and removes its temporary
+Exit code 0 only if all examples pass. Ctrl-C stops it and removes its temporary
 files.";
 
 const CONTROLLER_EXAMPLES: &str = "\
@@ -165,30 +165,31 @@ Examples:
   host-sim gateway -c cell.toml --bind rs485-1=pty:run/rs485-1 --set controller.address=127.0.0.1
   host-sim gateway -c cell.toml --set port.rs485-1.baud=9600 --stats 1s
   host-sim gateway -v -c cell.toml --bind rs485-1=serial:/dev/ttyUSB0
-                                                 -v says in words what is wrong, and when it is over
+                                                 -v logs in words what is wrong, and when it is over
   host-sim gateway -c cell.toml --bind hand=socketcan:can0 --capture - | wireshark -k -i -
   host-sim gateway -c cell.toml --bind hand=socketcan:can0 --record run --record-budget 10GiB
-  host-sim gateway -c cell.toml --console 127.0.0.1:8480 --console-key console.key --console-state revisions
+  host-sim gateway -c cell.toml --console 127.0.0.1:8480 --console-key console.key \\
+      --console-state revisions
       and then: curl http://127.0.0.1:8480/api/v1/status
   host-sim gateway -c cell.toml --bind hand=socketcan:can0 --sparkplug sparkplug.toml
-  host-sim gateway -c left.toml -c right.toml --bind left/hand=socketcan:can0 --bind right/hand=socketcan:can1
-                                                 one process for several cells: docs/several-cells.md
-  host-sim gateway -c new.toml --bind force=serial:/dev/ttyUSB0 --console 127.0.0.1:8480 --console-key console.key
-                                                 new.toml has no ports: the page in a browser adds them
+  host-sim gateway -c left.toml -c right.toml --bind left/hand=socketcan:can0 \\
+      --bind right/hand=socketcan:can1           several cells: docs/several-cells.md
+  host-sim gateway -c new.toml --bind force=serial:/dev/ttyUSB0 --console 127.0.0.1:8480 \\
+      --console-key console.key                  new.toml has no ports: add them in the browser
 
 Captures and recordings never delay the gateway: what cannot be written is lost and
-counted. docs/capture.md says what is in them.";
+counted. docs/capture.md describes their contents.";
 
 const CHECK_EXAMPLES: &str = "\
 Examples:
   host-sim check cell.toml
   host-sim check cell.toml --set port.rs485-1.baud=9600
   host-sim check cell.toml --same-bus can-1,can-2
-  host-sim check cell.toml --since 0.2           what it means now and did not in 0.2
+  host-sim check cell.toml --since 0.2           with changes in meaning since 0.2
   host-sim check cell.toml --json
 
-If something is wrong: exit code 2 and one message with file, line, column and key.
-With --json it is on stdout: {\"ok\": false, \"errors\": [...]}.";
+If the file is invalid: exit code 2 and one message with file, line, column and key.
+With --json it goes to stdout: {\"ok\": false, \"errors\": [...]}.";
 
 const IMAGE_EXAMPLES: &str = "\
 Examples:
@@ -196,8 +197,8 @@ Examples:
   host-sim image cell.toml --set controller.address=10.0.2.2 -o cell.img";
 
 const ENCODE_EXAMPLES: &str = "\
-Values are given in field order or as NAME=VALUE: decimal, 0x1F or 0.5.
-A frame of an exchange that has only constants needs none. Else, without values, lines in the form that `decode` prints are read from stdin.
+Values are decimal, 0x1F or 0.5. Exchange frames made only of constants take none.
+Otherwise, without values, lines as `decode` prints them are read from stdin.
 
 Examples:
   host-sim encode cell.toml --part input 1
@@ -219,7 +220,7 @@ Frames are hex bytes (FF FF 01 EE EE, FFFF01EEEE); for a CAN recipe, what
 candump prints:
   (1436509052.249713) can0 123#AABB
     can0  123   [2]  AA BB
-Without frames, --log or stdin is read. Input that is no frame of the recipe is
+Without frames, --log or stdin is read. Input that is not a frame of the recipe is
 counted on stderr.
 
 Examples:
@@ -230,7 +231,7 @@ Examples:
 /// `--set`, for commands that read a file.
 #[derive(Debug, Args)]
 struct Overrides {
-    /// Override one key of the file, such as port.rs485-1.baud=9600
+    /// Override a key of the file, such as port.rs485-1.baud=9600; repeatable
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
@@ -240,14 +241,14 @@ struct Overrides {
 struct Which {
     /// A gateway file or a controller file
     file: PathBuf,
-    /// The recipe's name; not needed when there is only one
+    /// The recipe's name; optional if there is only one
     #[arg(long, value_name = "NAME")]
     recipe: Option<String>,
-    /// The part: input (user to robot) or output (robot to user), or the frame of an exchange: request,
-    /// reply, pending or refusal; not needed when there is only one
+    /// The part: input (user to robot), output (robot to user), or a frame of an exchange; optional if there is
+    /// only one
     #[arg(long)]
     part: Option<PartName>,
-    /// The number of the exchange or block in the recipe, from 1; not needed when there is only one
+    /// The number of the exchange or block in the recipe, from 1; optional if there is only one
     #[arg(long, value_name = "N")]
     exchange: Option<usize>,
     #[command(flatten)]
@@ -304,10 +305,10 @@ impl From<PartName> for Chosen {
 struct EncodeArgs {
     #[command(flatten)]
     which: Which,
-    /// The CAN id of the frame; not needed when there is only one
+    /// The CAN id of the frame, such as 2 or 0x501; optional if there is only one
     #[arg(long, value_name = "ID", value_parser = convert::parse_id)]
     id: Option<u32>,
-    /// The values
+    /// Values in field order, or NAME=VALUE
     #[arg(allow_negative_numbers = true)]
     values: Vec<String>,
 }
@@ -316,10 +317,10 @@ struct EncodeArgs {
 struct DecodeArgs {
     #[command(flatten)]
     which: Which,
-    /// Read frames from this file
+    /// Read frames from this file, such as a candump log
     #[arg(long, value_name = "FILE", conflicts_with = "frames")]
     log: Option<PathBuf>,
-    /// Frames as hex bytes
+    /// Frames in hexadecimal, such as FFFF01EEEE
     frames: Vec<String>,
 }
 

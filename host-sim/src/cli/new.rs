@@ -17,10 +17,10 @@ use templates::{ALL, Template};
 /// Arguments of `new`.
 #[derive(Debug, Args)]
 pub(super) struct NewArgs {
-    /// The device; without it, all devices are listed
+    /// The device, such as robotiq-ft300; without it, list all devices
     #[arg(long, value_name = "NAME")]
     device: Option<String>,
-    /// Write the gateway file here instead of to stdout; an existing file is never replaced
+    /// Write the gateway file here instead of to stdout; never replaces a file
     #[arg(short, long, value_name = "FILE", requires = "device")]
     output: Option<PathBuf>,
 }
@@ -31,8 +31,8 @@ Examples:
   host-sim new --device robotiq-ft300            its gateway file, on stdout
   host-sim new --device robotiq-ft300 -o cell.toml
 
-The file says how the device is wired and set, where its protocol is published,
-and has worked bytes of its frames. Set `controller.address` in it.";
+The file says how to wire and set the device and where its protocol is published, and
+shows example frames byte by byte. Set `controller.address` in it.";
 
 pub(super) fn run(args: &NewArgs, out: &mut dyn Write) -> CliResult {
     let Some(name) = &args.device else { return list(out) };

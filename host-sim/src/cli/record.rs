@@ -13,20 +13,20 @@ use recipe_runtime::RunError;
 /// Arguments of captures and recordings.
 #[derive(Debug, Args)]
 pub(super) struct WatchArgs {
-    /// Capture the frames of all ports for Wireshark (pcapng) into this file, a pipe, or - for stdout; `ready` then
-    /// goes to stderr
+    /// Capture the frames of all ports for Wireshark (pcapng) to this file or pipe, or to stdout with -, which moves
+    /// the `ready` line to stderr
     #[arg(long, value_name = "FILE")]
     capture: Option<PathBuf>,
-    /// Capture what goes over the links to the controller too
+    /// Also capture the bytes on the links to the controller
     #[arg(long, requires = "capture")]
     capture_links: bool,
-    /// Record the run into this folder (MCAP): decoded frames, and all that `host-sim replay` needs
+    /// Record the run to this folder (MCAP): decoded frames, and all that `host-sim replay` needs
     #[arg(long, value_name = "FOLDER")]
     record: Option<PathBuf>,
-    /// Most room that all recordings of the folder take; the oldest are removed
+    /// Largest size of all recordings in the folder together; the oldest are removed
     #[arg(long, value_name = "SIZE", default_value = "1GiB", value_parser = parse_size, requires = "record")]
     record_budget: u64,
-    /// Largest size of one file of a recording; at most half of the budget
+    /// Largest size of one recording file; at most half of the budget
     #[arg(long, value_name = "SIZE", default_value = "100MiB", value_parser = parse_size, requires = "record")]
     record_file: u64,
 }

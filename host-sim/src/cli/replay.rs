@@ -16,10 +16,9 @@ use super::wrong;
 /// Arguments of `replay`.
 #[derive(Debug, Args)]
 pub(super) struct ReplayArgs {
-    /// A recording: a folder, whose newest run is taken; a file of a run, which stands for all its files; or a plain
-    /// recording
+    /// A folder of recordings, of which the newest run is taken; any file of a run; or a plain recording
     recording: PathBuf,
-    /// Write the plain recording here, as `proto_core::record` and a board's replay take it
+    /// Also write a plain recording to this new file, for `proto_core::record` and a board's replay
     #[arg(long, value_name = "FILE")]
     plain: Option<PathBuf>,
 }
@@ -31,11 +30,11 @@ Examples:
   host-sim replay run/20261122-204500-123.0001.mcap
   host-sim replay run --plain cell.rgr
 
-The configuration is in the recording. Everything that came in is given to this
-program's engine at its time, and all that goes out is compared.
+The recording includes the configuration. This program's engine gets every recorded
+input at its time, and its outputs are compared with the recorded ones.
 
-Exit codes: 0 the same to the end; 1 something differs, or calls are missing in the
-recording; 2 it cannot be replayed.";
+Exit codes: 0 the same to the end; 1 something differs, or the recording has a gap;
+2 it cannot be replayed.";
 
 pub(super) fn run<W: Write>(args: &ReplayArgs, mut out: Out<W>) -> ExitCode {
     let plain = args.plain.as_ref().map(|path| {

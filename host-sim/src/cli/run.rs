@@ -26,33 +26,33 @@ use recipe_runtime::{EventsFile, PublisherConfig, ReadyFile, RunError, RunOption
 pub(super) struct RunArgs {
     #[command(flatten)]
     overrides: Overrides,
-    /// Bind a port to a device: pty:PATH, pty-paced:PATH, serial:/dev/ttyUSB0, tcp:HOST:PORT,
-    /// tcp-listen:HOST:PORT; socketcan:vcan0, slcan-pty:PATH, slcan-tcp:HOST:PORT[,PATH], the last two
-    /// also as slcan-pty-unpaced and slcan-tcp-unpaced. With --console also for ports that the file does not
-    /// have yet: they are used once a revision has the port
+    /// Bind a port to a device (docs/devices.md); repeatable. Serial: pty:PATH, pty-paced:PATH,
+    /// serial:/dev/ttyUSB0, tcp:HOST:PORT, tcp-listen:HOST:PORT. CAN: socketcan:vcan0, slcan-pty:PATH,
+    /// slcan-tcp:HOST:PORT[,PATH]; with slcan-pty-unpaced and slcan-tcp-unpaced frames take no time. With
+    /// --console, a port may be missing in the file and be added by a later revision
     #[arg(long, value_name = "NAME=DEVICE")]
     bind: Vec<Bind>,
-    /// Write the actual addresses to this file once everything is listening; removed at the end
+    /// Write the actual addresses to this file (JSON) once everything is listening; removed at the end
     #[arg(long, value_name = "FILE")]
     ready: Option<PathBuf>,
-    /// Print a line of counters at this interval, such as 1s or 200ms, until stdout is closed
+    /// Print counters as a line of JSON at this interval, such as 1s or 200ms; the run ends when stdout is closed
     #[arg(long, value_name = "TIME", value_parser = parse_time)]
     stats: Option<Duration>,
-    /// Do not ask the system for real-time scheduling (SCHED_FIFO)
+    /// Do not request real-time scheduling (SCHED_FIFO)
     #[arg(long)]
     no_realtime: bool,
-    /// Serve the API at this address (docs/api.md), such as 127.0.0.1:8480; port 0: any
+    /// Serve the HTTP API (docs/api.md) and its page at this address, such as 127.0.0.1:8480; port 0: any free port
     #[arg(long, value_name = "ADDRESS:PORT")]
     console: Option<SocketAddr>,
-    /// The key for changes, and for other machines: 32 hexadecimal digits in a file of mode 0600, such as
-    /// made by `(umask 077; openssl rand -hex 16 > FILE)`
+    /// File with the key that is needed for changes and from other machines: 32 hexadecimal digits, mode
+    /// 0600; `host-sim ctl keygen FILE` makes one
     #[arg(long, value_name = "FILE", requires = "console")]
     console_key: Option<PathBuf>,
-    /// Keep the last 8 revisions of the configuration in this folder, and run the live one after a restart,
-    /// unless the file was changed; only for the gateway
+    /// Gateway only: keep the last 8 revisions of the configuration in this folder, and run the live one after
+    /// a restart, unless the file was changed
     #[arg(long, value_name = "DIR", requires = "console")]
     console_state: Option<PathBuf>,
-    /// The port of the other console on this machine, the controller's or the gateway's: its page becomes a tab
+    /// The --console port of the other program on this machine, controller or gateway: its page becomes a tab
     #[arg(long, value_name = "PORT", requires = "console")]
     console_peer: Option<u16>,
 }
@@ -60,19 +60,19 @@ pub(super) struct RunArgs {
 /// Arguments of `gateway`.
 #[derive(Debug, Args)]
 pub(super) struct GatewayRun {
-    /// The configuration file. With several, one process serves several cells, each called like its file without the
+    /// The gateway file. Repeat it to serve several cells in one process, each named after its file without the
     /// extension; then write --bind CELL/NAME=DEVICE and --set CELL/KEY=VALUE
     #[arg(short, long, value_name = "FILE", required = true)]
     config: Vec<PathBuf>,
-    /// Serve several cells on so many threads; without it, one for each processor
+    /// Number of threads for several cells [default: one per processor]
     #[arg(long, value_name = "N")]
     threads: Option<NonZeroUsize>,
     #[command(flatten)]
     run: RunArgs,
     #[command(flatten)]
     watch: WatchArgs,
-    /// Tell a broker what this gateway knows: Sparkplug B over MQTT, by this file (docs/fleet.md). Nothing can be
-    /// written or commanded from there
+    /// Publish what this gateway knows to an MQTT broker (Sparkplug B), as this file says (docs/fleet.md). The broker
+    /// cannot write or command anything
     #[arg(long, value_name = "FILE")]
     sparkplug: Option<PathBuf>,
 }
@@ -80,23 +80,23 @@ pub(super) struct GatewayRun {
 /// Arguments of `controller`.
 #[derive(Debug, Args)]
 pub(super) struct ControllerRun {
-    /// The configuration file
+    /// The controller file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
     #[command(flatten)]
     run: RunArgs,
-    /// How the controller's clock runs: real; factor=N, so many times as fast as the machine's, such as 20 or
-    /// 0.5; stepped, only by `advance` and `wait` at the control socket
+    /// How the controller's clock runs: real; factor=N, N times as fast as the machine's, 0.001 to 1000;
+    /// stepped, moved only by `pendant advance` and `pendant wait`
     #[arg(long, value_name = "real|stepped|factor=N", default_value = "real", value_parser = parse_pace)]
     time: Pace,
-    /// Choose the phases of the state stream and of the ports' cycles, and what random faults send; without
-    /// it all phases are 0
+    /// Seed for the phases of the state stream and of the ports' cycles, and for what `garbage` faults send;
+    /// without it all phases are 0
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Write every event as a line of JSON to this file; an events file of an earlier run is replaced
+    /// Write each event to this file as a line of JSON; the events file of an earlier run is replaced
     #[arg(long, value_name = "FILE")]
     events: Option<PathBuf>,
-    /// Do the operations of this file at their times and under their conditions
+    /// Execute the operations in this file, each at its time or on its condition (docs/control.md)
     #[arg(long, value_name = "FILE")]
     timeline: Option<PathBuf>,
 }

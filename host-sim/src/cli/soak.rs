@@ -31,7 +31,7 @@ the robot's side it checks that values and commands are recent when they arrive,
 that stops and safe values do arrive (docs/cell.md).
 
 The same seed gives the same trace hash on every machine and for any --jobs. A
-violation is printed with the command that repeats it.
+violation is printed with the command that reproduces it.
 
 Examples:
   host-sim soak                                  one hour
@@ -40,7 +40,7 @@ Examples:
   host-sim soak --cell cell.toml,robot.toml      your own gateway and controller
   host-sim soak --replay 93570312@41.250300 --trace
 
-On three machines with the same host-sim, each with its own number, then on one:
+On three machines with the same host-sim, shards 1/3 to 3/3, then on one of them:
   host-sim soak --hours 72 --seed 42 --shard 1/3 --json > 1.json
   host-sim soak merge 1.json 2.json 3.json       the table and the hash of all 72 hours
 
@@ -52,39 +52,39 @@ Exit codes: 0 all invariants held; 1 one was violated; 2 an argument is invalid.
 pub(super) struct SoakArgs {
     #[command(subcommand)]
     command: Option<SoakCommand>,
-    /// Virtual hours of all runs together
+    /// Virtual hours of all runs together, such as 24 or 0.5, at most 100000
     #[arg(long, value_name = "HOURS", default_value = "1", value_parser = parse_hours)]
     hours: Duration,
-    /// The seed from which the seeds of all runs are derived
+    /// Seed from which the seeds of all runs are derived
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// How often faults are injected
     #[arg(long, value_name = "LEVEL", default_value = "harsh")]
     faults: LevelName,
-    /// An embedded cell by name, or GATEWAY.toml,CONTROLLER.toml; can be repeated
+    /// An embedded cell by name, such as force-sensor, or GATEWAY.toml,CONTROLLER.toml; repeatable
     /// [default: all embedded cells]
     #[arg(long, value_name = "CELL")]
     cell: Vec<String>,
-    /// Number of threads [default: one per processor]
+    /// Number of threads, at most 1024 [default: one per processor]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
-    /// Run only this share of the runs, such as 1/3; `soak merge` makes one result of all shares
+    /// Run only this share of the runs, such as 1/3; `soak merge` combines the results. Needs --json
     #[arg(long, value_name = "NTH/OF", requires = "json")]
     shard: Option<Share>,
-    /// Print one JSON document in place of the table
+    /// Print one JSON document instead of the table
     #[arg(long)]
     json: bool,
     /// Repeat one run up to this instant, with the same --cell and --faults
     #[arg(long, value_name = "SEED@SECONDS", value_parser = parse_replay, conflicts_with_all = ["shard", "json"])]
     replay: Option<(u64, Duration)>,
-    /// With --replay: show the trace of the last two seconds
+    /// With --replay: print the trace of the last two seconds
     #[arg(long, requires = "replay")]
     trace: bool,
 }
 
 #[derive(Debug, Subcommand)]
 enum SoakCommand {
-    /// Make one result of the documents of all shares, as if one machine had run them
+    /// Combine the results of all shares, as if one machine had run them
     #[command(after_help = merge::EXAMPLES)]
     Merge(merge::MergeArgs),
 }

@@ -15,10 +15,10 @@ use super::table::{failure, rare_outcomes, table};
 use super::{PASS, wrong};
 
 pub(super) const EXAMPLES: &str = "\
-The files are what `soak --json` has printed: one for each share, in any order, of one
-run with the same --hours, --seed, --faults, --cell and the same host-sim. A file that
-is missing, given twice, or of another run is refused. The table is that of one machine
-that has run everything, with the same trace hash; the wall time is the longest.
+Give one file for each share, in any order, all with the same --hours, --seed, --faults,
+--cell and host-sim. A file that is missing, given twice, or of another run is refused.
+The table and the trace hash are those of one machine that has run everything; the wall
+time is the longest.
 
 Examples:
   host-sim soak merge 1.json 2.json 3.json
@@ -29,10 +29,10 @@ Exit codes: 0 all invariants held; 1 one was violated; 2 a file cannot be used."
 /// Arguments of `soak merge`.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct MergeArgs {
-    /// What `soak --shard NTH/OF --json` has printed, of all shares
+    /// Outputs of `soak --shard NTH/OF --json`, one for each share
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
-    /// Print one JSON document in place of the table
+    /// Print one JSON document instead of the table
     #[arg(long)]
     json: bool,
 }
