@@ -28,25 +28,25 @@ use work::CtlWork;
 /// Arguments of `ctl`.
 #[derive(Debug, Args)]
 pub(super) struct CtlArgs {
-    /// The gateway: ADDRESS or ADDRESS:PORT; without a port 80, on this machine 8480
+    /// The gateway, ADDRESS or ADDRESS:PORT; port 80 by default, 8480 on this machine [env: HOST_SIM_GATEWAY]
     #[arg(long, value_name = "ADDRESS", global = true)]
     to: Option<Address>,
-    /// The address that the gateway knows itself by, if --to is a forwarded port
+    /// The gateway's own address, if --to is a forwarded port
     #[arg(long, value_name = "ADDRESS", global = true)]
     host: Option<Address>,
-    /// The file with its key, of mode 0600; reading on this machine needs none
+    /// File with its key, mode 0600; not needed to read on this machine [env: HOST_SIM_GATEWAY_KEY]
     #[arg(long, value_name = "FILE", global = true)]
     key: Option<PathBuf>,
-    /// In place of --to and --key: the gateways of this file, all at once
+    /// Instead of --to and --key: all gateways in this file
     #[arg(long, value_name = "FILE", conflicts_with_all = ["to", "key"], global = true)]
     inventory: Option<PathBuf>,
-    /// Only this gateway of the inventory; may be given several times
+    /// Only this gateway of the inventory; repeatable
     #[arg(long, value_name = "NAME", requires = "inventory", global = true)]
     only: Vec<String>,
-    /// How long a request and its answer may take, such as 5s
+    /// Time limit for a request with its answer
     #[arg(long, value_name = "TIME", default_value = "5s", value_parser = parse_time, global = true)]
     timeout: Duration,
-    /// Print JSON, one document a line
+    /// Print JSON, one document per line
     #[arg(long, global = true)]
     json: bool,
     #[command(subcommand)]

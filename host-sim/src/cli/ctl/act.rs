@@ -13,99 +13,99 @@ use super::help;
 /// Something that `ctl` does.
 #[derive(Debug, Subcommand)]
 pub(super) enum Act {
-    /// Who and what it is: name, role, version, ports, revision
+    /// Show the gateway's name, role, version, ports and revision
     Info,
-    /// Health, ports, links, the controller's states, latencies
+    /// Show health, ports, links, the controller's states and latencies
     #[command(after_help = help::STATUS)]
     Status {
-        /// Go on, five times a second, until Ctrl-C
+        /// Refresh five times a second until Ctrl-C
         #[arg(long)]
         watch: bool,
     },
-    /// The known variables: value, age, and the port that owns them
+    /// Show the known variables: value, age, and the port that owns them
     #[command(after_help = help::VALUES)]
     Values {
-        /// Only variables whose names contain one of these
+        /// Only variables whose names contain one of these texts
         filter: Vec<String>,
-        /// Go on, five times a second, until Ctrl-C
+        /// Refresh five times a second until Ctrl-C
         #[arg(long)]
         watch: bool,
     },
-    /// Frames as they come and go, by name, until Ctrl-C
+    /// Show frames with named fields as they come and go, until Ctrl-C
     #[command(after_help = help::TRACE)]
     Trace {
-        /// Only those of this port
+        /// Only frames of this port
         port: Option<String>,
-        /// A gateway file, for the names of frames and fields that a board does not have
+        /// Gateway file with the names of frames and fields, which a board does not know
         #[arg(long, value_name = "FILE")]
         file: Option<PathBuf>,
     },
-    /// Say what is wrong: ports, devices, links, the controller's mode
+    /// Report what is wrong with ports, devices, links and the controller's mode
     #[command(after_help = help::DOCTOR)]
     Doctor {
-        /// How long a board is listened to, 6s at least; devices that speak rarely need longer
+        /// How long to listen to a board, at least 6s; longer for devices that send rarely
         #[arg(long = "for", value_name = "TIME", default_value = "6s", value_parser = parse_time)]
         time: Duration,
     },
-    /// Frames as a file for Wireshark, until Ctrl-C
+    /// Write frames to a file for Wireshark, until Ctrl-C
     #[command(after_help = help::CAPTURE)]
     Capture {
-        /// The file, pcapng
+        /// The pcapng file to write
         file: PathBuf,
-        /// Only those of this port
+        /// Only frames of this port
         #[arg(long, value_name = "NAME")]
         port: Option<String>,
-        /// For so long, such as 10s
+        /// Stop after this time, such as 10s
         #[arg(long = "for", value_name = "TIME", value_parser = parse_time)]
         time: Option<Duration>,
     },
-    /// Everything that somebody who helps wants to see, in one file
+    /// Write everything that support needs to one file
     #[command(after_help = help::BUNDLE)]
     Bundle {
-        /// The file, JSON
+        /// The JSON file to write
         file: PathBuf,
-        /// Replace a file that exists
+        /// Replace an existing file
         #[arg(long)]
         force: bool,
     },
-    /// State, counters and latencies as OpenMetrics
+    /// Print state, counters and latencies as OpenMetrics
     Metrics,
-    /// The newest lines of its log
+    /// Print the newest lines of the gateway's log
     Log {
-        /// So many at most
+        /// Number of lines at most, 1 to 256
         #[arg(short = 'n', long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=256))]
         lines: u32,
     },
-    /// The configuration that runs, or another one that is kept
+    /// Print the running configuration, or a stored revision
     #[command(after_help = help::CONFIG)]
     Config {
-        /// Not the one that runs but this one
+        /// This revision instead of the running one
         #[arg(long, value_name = "N")]
         revision: Option<u32>,
-        /// Write it to this file
+        /// Write to this file instead of to stdout
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
-        /// Replace a file that exists
+        /// Replace an existing file
         #[arg(long, requires = "output")]
         force: bool,
     },
-    /// What is kept, what runs, what is on trial
+    /// Show which revisions are stored, running and on trial
     Revisions,
-    /// Store a configuration
+    /// Send a gateway a configuration to store
     #[command(after_help = help::PUSH)]
     Push {
-        /// A gateway file, or for a board an image
+        /// A gateway file; for a board also an image
         file: PathBuf,
-        /// For a board: override one key of the file, such as controller.address=10.0.0.9
+        /// For a board: override a key of the file, such as controller.address=10.0.0.9; repeatable
         #[arg(long, value_name = "KEY=VALUE")]
         set: Vec<String>,
-        /// The board that it is for, nucleo-h743zi or mps2-an500: what it has not is refused before anything is sent
+        /// Refuse, before anything is sent, what this board cannot run: nucleo-h743zi or mps2-an500
         #[arg(long, value_name = "BOARD")]
         board: Option<Board>,
-        /// Put it on trial at once
+        /// Start its trial at once
         #[arg(long)]
         apply: bool,
-        /// With --apply: seconds until it is taken back unless it is confirmed
+        /// With --apply: seconds until it is taken back unless confirmed, 1 to 3600
         #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = seconds, requires = "apply")]
         confirm_s: f64,
         #[command(flatten)]
@@ -114,68 +114,68 @@ pub(super) enum Act {
     /// Run the stored configuration on trial
     #[command(after_help = help::APPLY)]
     Apply {
-        /// Another one that is kept
+        /// Run this stored revision instead of the newest
         #[arg(long, value_name = "N")]
         revision: Option<u32>,
-        /// Seconds until it is taken back unless it is confirmed
+        /// Seconds until it is taken back unless confirmed, 1 to 3600
         #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = seconds)]
         confirm_s: f64,
         #[command(flatten)]
         many: Many,
     },
-    /// Keep what is on trial
+    /// Keep the configuration that is on trial
     #[command(after_help = help::CONFIRM)]
     Confirm {
         #[command(flatten)]
         many: Many,
     },
-    /// End the trial
+    /// End the trial and return to the live revision
     #[command(after_help = help::ROLLBACK)]
     Rollback {
-        /// Without a trial, return to the revision that was live before, at once
+        /// Without a trial: return at once to the revision that was live before
         #[arg(long)]
         previous: bool,
     },
-    /// Give a board another firmware, or show which one runs
+    /// Update the firmware of a board, or show which one runs
     #[command(after_help = help::UPDATE)]
     Update(UpdateArgs),
-    /// Let a board tell a broker what it knows, as an edge node of Sparkplug, or show how its node does
+    /// Set up a board as a Sparkplug edge node of an MQTT broker, or show the state of its node
     #[command(after_help = help::EDGE)]
     Edge {
-        /// The Sparkplug file; without it, how the node does
+        /// The Sparkplug file (docs/fleet.md); without it, show the node's state
         file: Option<PathBuf>,
-        /// It tells nothing any more
+        /// Switch the node off
         #[arg(long, conflicts_with = "file")]
         off: bool,
-        /// Start the board again, so that it counts at once
+        /// Restart the board, so that the change takes effect at once
         #[arg(long)]
         restart: bool,
     },
-    /// Show which one it is: a board lets its lamp blink, a host writes a line to its log
+    /// Identify a gateway: a board blinks its LED, a host writes a line to its log
     Identify {
-        /// For so many seconds
+        /// Number of seconds, 1 to 60
         #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=60))]
         seconds: u32,
     },
-    /// Give a board its first key, which is made here and written to a file
+    /// Give a board its first key, which is generated here and written to a file
     #[command(after_help = help::CLAIM)]
     Claim {
-        /// The file for the key; one from an earlier attempt is used again
+        /// File for the key; a key from an earlier attempt is used again
         file: PathBuf,
     },
-    /// Make a key: 128 random bits in a new file of mode 0600
+    /// Generate a key: 128 random bits in a new file of mode 0600
     #[command(after_help = help::KEYGEN)]
     Keygen {
-        /// The file, which must not exist
+        /// The file, which must not exist yet
         file: PathBuf,
-        /// A key to sign firmware with; the public key goes to FILE.pub
+        /// Generate a private key to sign firmware with; the public key goes to FILE.pub
         #[arg(long)]
         signing: bool,
     },
-    /// Make an update of a board's firmware, signed
+    /// Make a signed update of a board's firmware
     #[command(after_help = help::SIGN, disable_version_flag = true)]
     Sign {
-        /// The file with the private key, of `keygen --signing`
+        /// File with the private key, made by `keygen --signing`
         #[arg(long, value_name = "FILE")]
         signing_key: PathBuf,
         /// The board, such as nucleo-h743zi
@@ -184,40 +184,40 @@ pub(super) enum Act {
         /// The version of the firmware, such as 0.3.0
         #[arg(long, value_name = "VERSION")]
         version: String,
-        /// The program linked for slot A, ELF
+        /// The firmware linked for slot A (ELF)
         #[arg(long, value_name = "FILE")]
         slot_a: PathBuf,
-        /// The program linked for slot B, ELF
+        /// The firmware linked for slot B (ELF)
         #[arg(long, value_name = "FILE")]
         slot_b: PathBuf,
-        /// The versions of the configuration image that it reads, such as 1-3, if it is of another release
+        /// Versions of the configuration image that it reads, such as 1-3; for firmware of another release only
         #[arg(long, value_name = "OLDEST-NEWEST", value_parser = formats)]
         reads: Option<(u32, u32)>,
-        /// The version of the configuration image that it writes; otherwise the newest that it reads
+        /// Version of the configuration image that it writes [default: the newest that it reads]
         #[arg(long, value_name = "N")]
         writes: Option<u32>,
-        /// The update
+        /// The update to write
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
-        /// Replace a file that exists
+        /// Replace an existing file
         #[arg(long)]
         force: bool,
     },
-    /// Show what an update contains, and whether it is whole
+    /// Show what an update contains, and check that it is intact
     #[command(after_help = help::INSPECT)]
     Inspect {
         /// The update
         file: PathBuf,
-        /// The file with the public key that it has to be signed for
+        /// File with the public key to check its signature with
         #[arg(long, value_name = "FILE")]
         public_key: Option<PathBuf>,
-        /// Write what a probe puts into this slot, a or b
+        /// Write the bytes that a probe flashes to this slot, a or b
         #[arg(long, value_name = "SLOT", value_parser = slot, requires = "output")]
         slot: Option<Slot>,
-        /// With --slot: the file
+        /// With --slot: the file to write
         #[arg(short, long, value_name = "FILE", requires = "slot")]
         output: Option<PathBuf>,
-        /// Replace a file that exists
+        /// Replace an existing file
         #[arg(long, requires = "output")]
         force: bool,
     },
@@ -226,10 +226,10 @@ pub(super) enum Act {
 /// How a change goes through an inventory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Args)]
 pub(super) struct Many {
-    /// With --inventory: so many gateways at a time; the next ones begin once these have ended
+    /// With --inventory: number of gateways in a batch; the next batch begins once all have ended
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     batch: Option<u16>,
-    /// With --inventory: begin no further batch once a gateway has failed
+    /// With --inventory: begin no further batch after a failure
     #[arg(long)]
     stop_on_failure: bool,
 }
@@ -288,24 +288,24 @@ fn slot(text: &str) -> Result<Slot, String> {
 /// Arguments of `update`.
 #[derive(Debug, Args)]
 pub(super) struct UpdateArgs {
-    /// The update, of `sign`; without it, what the board says
+    /// The update, made by `sign`; without it, show what runs
     pub(super) file: Option<PathBuf>,
-    /// Run it on trial
+    /// Restart the board with it on trial
     #[arg(long = "try", requires = "file")]
     pub(super) try_it: bool,
-    /// With --try or --inventory: seconds until it is taken back unless it was confirmed [default: 300]
+    /// With --try or --inventory: seconds until it is taken back unless confirmed, 60 to 3600 [default: 300]
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(60..=3600), requires = "file")]
     pub(super) confirm_s: Option<u32>,
-    /// Keep what is on trial; with --try, once it does as well as the one before
+    /// Keep the firmware on trial; with --try, once it works as well as the one before
     #[arg(long, conflicts_with = "back")]
     pub(super) confirm: bool,
-    /// Take back what is on trial
+    /// Return to the firmware before the trial
     #[arg(long, conflicts_with = "file")]
     pub(super) back: bool,
-    /// Take a firmware that is older than the one that runs
+    /// Accept firmware that is older than the running one
     #[arg(long, requires = "file")]
     pub(super) downgrade: bool,
-    /// With --inventory: what became of each board, a JSON document; renewed after each batch
+    /// With --inventory: write each board's outcome to this JSON file, renewed after each batch
     #[arg(long, value_name = "FILE", requires = "file")]
     pub(super) report: Option<PathBuf>,
     #[command(flatten)]
