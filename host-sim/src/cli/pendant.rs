@@ -21,8 +21,8 @@ pub(super) use request::Act;
 use socket::Socket;
 
 pub(super) const EXAMPLES: &str = "\
-The address is that of `control` in the controller's `ready` line. In zsh, names with
-brackets need quotes: 'DI[3]=1'.
+The control socket is `control` in the controller's `ready` line. In zsh, quote names
+with brackets: 'DI[3]=1'.
 
 Examples:
   host-sim controller -c robot.toml --ready run/ready.json &
@@ -36,18 +36,18 @@ Examples:
   host-sim pendant events --follow --kind command,reply
 
 Exit codes: 0 done, 1 the controller refused, or the condition did not hold in
-time, 2 an argument is wrong or nobody is there.";
+time, 2 an argument is invalid or the controller was not reached.";
 
 /// Arguments of `pendant`.
 #[derive(Debug, Args)]
 pub(super) struct PendantArgs {
-    /// The control socket: HOST:PORT, or a port of this machine; otherwise HOST_SIM_CONTROL says it
+    /// The control socket: HOST:PORT, or a port of this machine [env: HOST_SIM_CONTROL]
     #[arg(long, value_name = "ADDRESS", global = true)]
     to: Option<String>,
-    /// Read the address from this ready file
+    /// Read the address from the controller's ready file
     #[arg(long, value_name = "FILE", conflicts_with = "to", global = true)]
     ready: Option<PathBuf>,
-    /// Print the controller's answer, a line of JSON
+    /// Print the controller's answer as a line of JSON
     #[arg(long, global = true)]
     json: bool,
     #[command(subcommand)]

@@ -13,75 +13,75 @@ use crate::cli::run::parse_time;
 /// A command.
 #[derive(Debug, Subcommand)]
 pub(in crate::cli) enum Act {
-    /// Show the state of robot, programs, ports and faults
+    /// Show the state of the robot, its programs, ports and faults
     State {
-        /// Show it again and again, each half second or at this interval
+        /// Repeat until Ctrl-C, every 500ms or at this interval, such as --watch=2s
         #[arg(long, value_name = "TIME", num_args = 0..=1, require_equals = true,
             default_missing_value = "500ms", value_parser = parse_time)]
         watch: Option<Duration>,
     },
     /// Show the values of items, such as DI[3] DO[1] FloatInputReg[2] BitInputReg[3].4
     Get {
-        /// The items
+        /// Names of items
         #[arg(required = true)]
         items: Vec<String>,
     },
-    /// Set inputs, tool inputs and buttons, and registers: all of them, or none if one is wrong
+    /// Set inputs, tool inputs, tool buttons and registers; if one is wrong, none is set
     Set {
         /// NAME=VALUE, such as DI[3]=1, DI[4]=off, AI_V[2]=3.5
         #[arg(required = true, value_name = "NAME=VALUE")]
         items: Vec<String>,
     },
-    /// Turn the key
+    /// Turn the key switch to a mode
     Mode {
         /// The mode
         mode: ModeName,
     },
     /// Press the emergency stop
     EmergencyStop,
-    /// Open a safety door
+    /// Open a safety door (protective stop)
     ProtectiveStop,
-    /// Make the arm collide
+    /// Make the arm collide, which pauses the program
     Collide {
-        /// The joint, 1 to 6, or a sensor: 11 to 16 in the base, 20 at the end
+        /// Where: joint 1 to 6; base sensor 11 to 16 (X, Y, Z, Rx, Ry, Rz); end sensor 20
         axis: u8,
     },
     /// Release the stop and acknowledge it; the robot stays disabled
     Clear,
-    /// The safety controller stops watching the robot, which ends the program, or goes on
+    /// Make the safety controller stop monitoring the robot, which ends the program, or resume
     Hold {
-        /// Why it does not watch
+        /// The safety state to hold
         safety: HoldName,
     },
-    /// Somebody enters or leaves the zone of reduced speed
+    /// Enter or leave the zone of reduced speed
     Reduced {
-        /// Whether somebody is in it
+        /// Whether somebody is in the zone
         on: Switch,
     },
-    /// Show this error in the state stream and in getlasterror
+    /// Raise an error; the state stream and getlasterror show it
     RaiseError {
-        /// Its number, such as 0x1002
+        /// Error number, such as 4098 or 0x1002
         #[arg(value_parser = parse_code)]
         code: u32,
-        /// Its text
+        /// Error text
         #[arg(default_value = "")]
         text: String,
     },
     /// Acknowledge the error
     ClearError,
-    /// Switch the drives' power on; answered at once, see wait
+    /// Switch the drives' power on; returns at once, see `wait`
     PowerOn,
-    /// Switch the power off
+    /// Switch the drives' power off
     PowerOff,
     /// Enable the robot
     Enable,
     /// Disable the robot
     Disable,
-    /// Start a program, in manual mode too
+    /// Start a program, also in manual mode
     Run {
-        /// Its name
+        /// Name of the program
         program: String,
-        /// The speed, in per cent
+        /// Speed in percent, above 0 and at most 100
         #[arg(long, value_name = "PERCENT")]
         speed: Option<f32>,
     },
@@ -89,91 +89,91 @@ pub(in crate::cli) enum Act {
     Stop,
     /// Pause the program
     Pause,
-    /// Let the program go on
+    /// Resume the program
     Resume,
-    /// Add a program, or replace it
+    /// Add or replace a program
     Upload {
-        /// The script
+        /// File with the script
         file: PathBuf,
-        /// The program's name; otherwise the file's
+        /// Name of the program [default: that of the file]
         #[arg(long)]
         name: Option<String>,
     },
     /// Remove a program
     Remove {
-        /// Its name
+        /// Name of the program
         program: String,
     },
-    /// Show the programs' names
+    /// List the programs
     Programs,
-    /// Assign a recipe to a port
+    /// Assign a recipe of the controller file to a port
     Recipe {
-        /// The port
+        /// Name of the port
         port: String,
-        /// The recipe; without it, the port gets none
+        /// Name of the recipe; without it, the port gets none
         recipe: Option<String>,
     },
-    /// Set a port's cycle
+    /// Set the cycle time of a port
     Cycle {
-        /// The port
+        /// Name of the port
         port: String,
-        /// In milliseconds, at least 4
+        /// Cycle time in milliseconds, at least 4
         ms: f64,
     },
-    /// Switch the controller off and on; it boots
+    /// Switch the controller off and on again
     Restart {
-        /// All registers are 0 afterwards, not as in the file
+        /// Set all registers to 0 instead of to the file's values
         #[arg(long)]
         cleared: bool,
     },
-    /// Begin a fault, until healed
+    /// Inject a fault, which lasts until `heal`
     Fault {
         /// What it is on
         #[command(subcommand)]
         on: FaultOn,
     },
-    /// End the faults of a server, a port or an item, or all faults
+    /// End all faults, or those of a server, a port or an item
     Heal {
         /// What they are on
         #[command(subcommand)]
         on: Option<HealOn>,
     },
-    /// Move a stepped clock, and wait until it is there
+    /// Advance the clock of --time stepped, and wait until it is there
     Advance {
-        /// By so many seconds
+        /// Number of seconds
         seconds: f64,
     },
-    /// Wait until all of this is the case: robot=enable program=none DO[1]=1 coil:192=1 register:5=17
+    /// Wait until all conditions hold, such as robot=enable program=none DO[1]=1 coil:192=1 register:5=17
     /// event=program_ended event.program=pick.jspf
     Wait {
         /// robot, program-state, safety, mode, program, an item, coil:ADDRESS, register:ADDRESS, event or
         /// event.KEY, each with =VALUE
         #[arg(required = true, value_name = "KEY=VALUE")]
         until: Vec<String>,
-        /// For so many seconds of the controller's clock at most
+        /// Fail after this many seconds of the controller's clock
         #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
         timeout: f64,
     },
-    /// Show the kept events, or follow new ones
+    /// Show recorded events, or follow new ones
     Events {
-        /// From this number on
+        /// First event number to show
         #[arg(long, value_name = "N", default_value_t = 0)]
         since: u64,
         /// Only these kinds, separated by commas, such as command,reply
         #[arg(long, value_name = "KINDS", value_delimiter = ',')]
         kind: Vec<String>,
-        /// At most so many
+        /// Number of events at most
         #[arg(long, value_name = "N", default_value_t = 1_000)]
         max: usize,
-        /// Show each event from now on
+        /// Show each new event, until Ctrl-C
         #[arg(long, short, conflicts_with_all = ["since", "max"])]
         follow: bool,
     },
     /// Show the counters of the servers and ports
     Counters,
-    /// Send a request in JSON, such as '{"do": "state"}'
+    /// Send a request in JSON (docs/control.md), such as '{"do": "state"}'
     Do {
-        /// The request
+        /// The JSON object
         request: String,
     },
 }
@@ -191,7 +191,7 @@ pub(in crate::cli) enum HoldName {
     Update,
     /// SS_FAIL: it has failed
     Fail,
-    /// It watches again
+    /// It monitors the robot again
     None,
 }
 
@@ -223,59 +223,59 @@ pub(in crate::cli) enum Switch {
 
 #[derive(Debug, Subcommand)]
 pub(in crate::cli) enum FaultOn {
-    /// On the command port, 2000
+    /// Inject a fault at the command port, 2000
     Command(ServerFault),
-    /// On the state stream, port 2001
+    /// Inject a fault at the state stream, port 2001
     State(ServerFault),
-    /// On Modbus
+    /// Inject a fault at the Modbus server
     Modbus(ServerFault),
-    /// On a recipe port: it sends nothing, or a TCP client is disconnected once
+    /// Silence a recipe port, or disconnect it once if it is a TCP client
     Port {
-        /// Its name
+        /// Name of the port
         name: String,
         /// The fault
         kind: PortFault,
     },
-    /// Send another number in place of an item's value
+    /// Send another number instead of an item's value
     Item {
-        /// Its name, such as RobotState[8]
+        /// Name of the item, such as RobotState[8]
         name: String,
-        /// A number, nan, inf or -inf
+        /// What to send: a number, nan, inf or -inf
         #[arg(allow_hyphen_values = true)]
         value: String,
     },
-    /// Power, enable, stop and pause take so much longer
+    /// Make power, enable, stop and pause take longer
     Transitions {
-        /// In seconds
+        /// By this many seconds
         seconds: f64,
     },
 }
 
 #[derive(Debug, Args)]
 pub(in crate::cli) struct ServerFault {
-    /// What is wrong
+    /// The fault
     kind: ServerKind,
-    /// Of delay: seconds; of exception: its code, 1 to 11; of cut: bytes
+    /// For delay: seconds; for exception: its code, 1 to 11; for cut: number of bytes
     value: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum ServerKind {
-    /// It does not answer, but carries out
+    /// Executes requests, but does not answer
     Mute,
-    /// It answers later
+    /// Answers late (command, modbus)
     Delay,
-    /// It closes each new connection
+    /// Closes each new connection at once
     Refuse,
-    /// It closes all connections, once
+    /// Closes all connections, once
     Disconnect,
-    /// It sends random bytes
+    /// Sends random bytes instead of answers or packets
     Garbage,
-    /// Modbus: each request gets this exception
+    /// Answers each request with this exception (modbus)
     Exception,
-    /// State: the same packet again and again
+    /// Sends the same packet again and again (state)
     Freeze,
-    /// State: once, the front of a packet
+    /// Sends the first bytes of a packet, then closes; once (state)
     Cut,
 }
 
@@ -287,23 +287,23 @@ pub(in crate::cli) enum PortFault {
 
 #[derive(Debug, Subcommand)]
 pub(in crate::cli) enum HealOn {
-    /// The command port
+    /// End the faults at the command port
     Command,
-    /// The state stream
+    /// End the faults at the state stream
     State,
-    /// Modbus
+    /// End the faults at the Modbus server
     Modbus,
-    /// A recipe port
+    /// End the faults at a recipe port
     Port {
-        /// Its name
+        /// Name of the port
         name: String,
     },
-    /// An item
+    /// End the fault of an item
     Item {
-        /// Its name
+        /// Name of the item
         name: String,
     },
-    /// The transitions
+    /// End the delay of power, enable, stop and pause
     Transitions,
 }
 
