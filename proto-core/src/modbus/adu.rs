@@ -24,7 +24,7 @@ const UNIT: u64 = 0xFF << UNIT_SHIFT;
 const FUNCTION: u64 = 0xFF;
 /// The length field counts the unit id and the PDU: at least a function code, at most 253 bytes (D10).
 const LENGTHS: core::ops::RangeInclusive<u16> = NO_DATA..=254;
-/// The length field of a frame without anything behind its function code.
+/// Value of the length field of a frame without data: unit id and function code.
 const NO_DATA: u16 = 2;
 
 /// One received frame.
@@ -39,7 +39,7 @@ pub struct Adu<'a> {
     pub pdu: &'a [u8],
 }
 
-/// A header after which frames can no longer be found: the connection must be closed (D10).
+/// A header after which the next frame can no longer be found: the connection must be closed (D10).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -67,26 +67,24 @@ impl fmt::Display for AduError {
 
 impl core::error::Error for AduError {}
 
-/// Cuts a connection's bytes into frames.
+/// Splits a connection's bytes into frames.
 ///
-/// Holds at most one partial frame. A frame that lies whole in a chunk is returned in place,
-/// without a copy.
+/// Holds at most one partial frame. A frame that is complete in one chunk is returned without a copy.
 #[derive(Debug, Clone)]
 pub struct AduReader {
     buffer: [u8; MAX_ADU],
     filled: usize,
 }
 
-/// A whole frame.
 #[derive(Clone, Copy)]
 pub(super) struct AduFrame<'a> {
     pub(super) front: Front,
-    /// What comes behind the function code.
+    /// Data after the function code.
     pub(super) data: &'a [u8],
 }
 
-/// Transaction id, protocol id, length, unit id and function code: what every frame begins with, as one number, the
-/// first byte in its highest bits. So they are compared and written at once.
+/// The first eight bytes of a frame as one big-endian number, so they are compared and written at once: transaction id,
+/// protocol id, length, unit id and function code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Front(u64);
 
@@ -102,12 +100,11 @@ impl AduReader {
         Self { buffer: [0; MAX_ADU], filled: 0 }
     }
 
-    /// Takes bytes from the front of `chunk` up to the end of the next frame and returns it;
-    /// `None` once all of `chunk` is taken and no frame is complete.
+    /// Takes bytes from the front of `chunk` up to the end of the next frame and returns the frame; `None` once all of
+    /// `chunk` is taken and no frame is complete.
     ///
     /// # Errors
-    /// After an [`AduError`] the rest of the chunk is dropped and the connection must be closed;
-    /// the reader is at the start of a connection again.
+    /// After an [`AduError`] the rest of the chunk is dropped and the connection must be closed; the reader is reset.
     pub fn next_adu<'s, 'c: 's>(&'s mut self, chunk: &mut &'c [u8]) -> Option<Result<Adu<'s>, AduError>> {
         let received = *chunk;
         let (front, bytes) = match self.take(chunk) {
@@ -122,18 +119,18 @@ impl AduReader {
         Some(Ok(Adu { transaction, unit, pdu: pdu.unwrap_or_default() }))
     }
 
-    /// Forgets a partial frame, for a new connection.
+    /// Drops a partial frame, for a new connection.
     pub const fn reset(&mut self) {
         self.filled = 0;
     }
 
-    /// Bytes of a partial frame that are held.
+    /// Number of held bytes of a partial frame.
     pub const fn pending(&self) -> usize {
         self.filled
     }
 
-    /// Takes a frame that lies whole at the front of `chunk`. `None`, with nothing taken, if
-    /// [`Self::next_buffered`] has to look at what is there.
+    /// Takes a frame that is complete at the front of `chunk`. Returns `None`, with nothing taken, if
+    /// [`Self::next_buffered`] has to handle the bytes: a frame in pieces, or a wrong header.
     pub(super) fn take<'c>(&self, chunk: &mut &'c [u8]) -> Option<AduFrame<'c>> {
         let (front, behind) = chunk.split_first_chunk().filter(|_| self.filled == 0)?;
         let front = Front::from_bytes(front);
@@ -142,10 +139,10 @@ impl AduReader {
         Some(AduFrame { front, data })
     }
 
-    /// Takes what a frame in pieces needs, and returns the front of the one that is whole then; its data is
-    /// [`Self::data`]. A header that is wrong comes here too.
+    /// Buffers bytes until a frame is complete and returns its front; [`Self::data`] returns its data. Also reports
+    /// wrong headers.
     pub(super) fn next_buffered(&mut self, chunk: &mut &[u8]) -> Option<Result<Front, AduError>> {
-        // As most chunks end.
+        // The usual end of a chunk.
         if chunk.is_empty() || !self.fill_to(PREFIX_LEN, chunk) {
             return None;
         }
@@ -164,7 +161,7 @@ impl AduReader {
         Some(Ok(Front::from_bytes(self.buffer.first_chunk()?)))
     }
 
-    /// The data of the frame that [`Self::next_buffered`] has just returned the front of.
+    /// The data of the frame whose front [`Self::next_buffered`] just returned.
     pub(super) fn data(&self, front: Front) -> &[u8] {
         self.buffer.get(FRONT_LEN..).and_then(|behind| behind.get(..front.data_len())).unwrap_or_default()
     }
@@ -184,27 +181,26 @@ impl AduReader {
 }
 
 impl Front {
-    /// How the first frame of a connection to a unit begins, but for its length and function code.
+    /// Front of the first frame of a connection to `unit`, with length and function code 0.
     pub(super) const fn first(unit: u8) -> Self {
         Self((unit as u64) << UNIT_SHIFT)
     }
 
-    /// The same of the next frame to that unit, with a function code and without a length.
+    /// Front of the next frame, with this function code and length 0.
     pub(super) const fn next(self, function: u8) -> Self {
         Self((self.0 & (TRANSACTION | UNIT)).wrapping_add(1 << TRANSACTION_SHIFT) | function as u64)
     }
 
-    /// This front, of a frame with `had` bytes behind the function code, of one with `data_len` bytes there.
+    /// Changes the length from `had` to `data_len` bytes of data.
     pub(super) const fn resized(self, had: usize, data_len: usize) -> Self {
         Self(self.0.wrapping_add((data_len as u64).wrapping_sub(had as u64) << LENGTH_SHIFT))
     }
 
-    /// This front, which is without a length, of a frame with `data_len` bytes behind the function code.
+    /// Sets the length, which is 0 here, for `data_len` bytes of data.
     pub(super) const fn carrying(self, data_len: usize) -> Self {
         Self(self.0 | ((data_len as u16).wrapping_add(NO_DATA) as u64) << LENGTH_SHIFT)
     }
 
-    /// The same front with another function code.
     pub(super) const fn with_function(self, function: u8) -> Self {
         Self(self.0 & !FUNCTION | function as u64)
     }
@@ -229,14 +225,14 @@ impl Front {
         self.0 as u8
     }
 
-    /// Number of bytes behind the function code, of a front whose header is right.
+    /// Number of bytes after the function code. The header must be valid.
     pub(super) const fn data_len(self) -> usize {
         ((self.0 >> LENGTH_SHIFT) as u16).wrapping_sub(NO_DATA) as usize
     }
 
-    /// The same; `None` if the header is wrong.
+    /// Number of bytes after the function code; `None` if the header is wrong.
     fn checked_data_len(self) -> Option<usize> {
-        // Protocol id and length together: the id has to be 0.
+        // Checks the protocol id, which must be 0, and the length together.
         let length = (self.0 >> LENGTH_SHIFT) as u32;
         let range = u32::from(*LENGTHS.start())..=u32::from(*LENGTHS.end());
         range.contains(&length).then(|| length.wrapping_sub(NO_DATA.into()) as usize)

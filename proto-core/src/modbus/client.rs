@@ -1,8 +1,8 @@
-//! The client's side of one connection, one transaction in flight (docs/wire/modbus.md section 6).
+//! The client side of one connection, with one transaction in flight (docs/wire/modbus.md section 6).
 //!
-//! In: a request to send, then the connection's bytes. Out: the request's frame, then its answer.
-//! Does not know time: the caller decides when an answer is overdue and calls [`Client::abort`].
-//! The late answer is recognised by its transaction id, counted and skipped.
+//! In: a request to send, then the connection's bytes. Out: the request's frame, then its answer. Does not know time:
+//! the caller decides when an answer is overdue and calls [`Client::abort`]. A late answer is recognised by its
+//! transaction id, counted and skipped.
 
 use core::fmt;
 
@@ -11,14 +11,14 @@ use super::exception::Exception;
 use super::parts::{OPERANDS_LEN, Operands, RequestParts, copy_cleared};
 use super::pdu::{PduEncodeError, Request, RequestHead, Response, ResponseError};
 
-/// The client's side of one connection.
+/// The client side of one connection.
 #[derive(Debug, Clone)]
 pub struct Client {
     reader: AduReader,
     in_flight: bool,
-    /// How the answer to the newest request begins if it was carried out, in flight or not.
+    /// Front of a good answer to the newest request, in flight or not.
     answer: Front,
-    /// How many bytes come behind that.
+    /// Bytes of data in that answer.
     answer_len: u16,
     /// Address, and count or value of the newest request.
     operands: Operands,
@@ -29,12 +29,12 @@ pub struct Client {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ClientEvent<'a> {
-    /// The request was carried out.
+    /// The answer to a request that was executed.
     Response(Response<'a>),
     /// The server refused the request; the connection is fine.
     Exception(Exception),
-    /// The server violated the protocol: the connection must be closed. A request in flight is
-    /// over, and the rest of the chunk is dropped.
+    /// The server violated the protocol: the connection must be closed. A request in flight has ended, and the rest of
+    /// the chunk is dropped.
     Violation(Violation),
 }
 
@@ -43,7 +43,7 @@ pub enum ClientEvent<'a> {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum Violation {
-    /// A header after which frames can no longer be found.
+    /// A header after which the next frame can no longer be found.
     Header(AduError),
     /// An answer to a request that was never sent.
     Transaction {
@@ -124,23 +124,22 @@ impl Client {
         self.operands.of(self.answer.function())
     }
 
-    /// Answers that arrived after their request had been given up, since the start.
+    /// Number of answers that arrived after their request was given up.
     pub const fn stale_answers(&self) -> u32 {
         self.stale
     }
 
-    /// Writes the request's frame to the front of `out` and returns its length; the request is then
-    /// in flight.
+    /// Writes the request's frame to the front of `out` and returns its length. The request is then in flight.
     ///
     /// # Errors
-    /// Nothing was written and nothing changed: a request is in flight, the count is outside the
-    /// function's limits, or `out` is too short (260 bytes are always enough).
+    /// Nothing was written or changed: a request is in flight, the count is outside the function's limits, or `out` is
+    /// too short (260 bytes are always enough).
     pub fn start(&mut self, request: Request<'_>, out: &mut [u8]) -> Result<usize, StartError> {
         if self.in_flight {
             return Err(StartError::Busy);
         }
         let parts = request.parts();
-        // What tells reads from writes is asked first, so that a request of a known kind goes straight there.
+        // Tells reads from writes first, so a request of a kind that is known at compile time needs no other checks.
         match parts.data {
             None => {
                 parts.check_count().map_err(StartError::Encode)?;
@@ -164,7 +163,7 @@ impl Client {
         }
     }
 
-    /// Writes what a request's frame has before its data, and waits for the answer.
+    /// Writes the part of a request's frame before its data, and expects the answer.
     fn begin(
         &mut self,
         parts: &RequestParts<'_>,
@@ -185,19 +184,19 @@ impl Client {
         self.in_flight = true;
     }
 
-    /// Takes bytes from the front of `bytes` up to the end of the next answer and returns what it
-    /// says; `None` once all of `bytes` is taken. To be called until then.
+    /// Takes bytes from the front of `bytes` up to the end of the next answer and returns the event. Call it until it
+    /// returns `None`: then all of `bytes` is taken.
     pub fn receive<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
         match self.take_answer(bytes) {
             Some(response) => Some(ClientEvent::Response(response)),
-            // As most chunks end.
+            // The usual end of a chunk.
             None if bytes.is_empty() => None,
             None => self.receive_other(bytes),
         }
     }
 
-    /// Takes the one answer that is expected, whole and at the front of the chunk. `None`, with nothing taken, if
-    /// [`Self::receive_other`] has to look closer.
+    /// Takes the expected answer if it is complete at the front of the chunk. Returns `None`, with nothing taken, for
+    /// anything else; call [`Self::receive_other`] then.
     fn take_answer<'c>(&mut self, bytes: &mut &'c [u8]) -> Option<Response<'c>> {
         if !self.in_flight {
             return None;
@@ -213,7 +212,7 @@ impl Client {
         Some(response)
     }
 
-    /// The same for anything else that may come: answers in pieces, refusals, late answers, violations.
+    /// Handles everything else: partial answers, exceptions, late answers, violations.
     fn receive_other<'s, 'c: 's>(&'s mut self, bytes: &mut &'c [u8]) -> Option<ClientEvent<'s>> {
         let newest = self.answer.transaction();
         loop {
@@ -242,7 +241,7 @@ impl Client {
                     }
                 });
             }
-            // Ids count up, so those in the half circle behind the newest one are older.
+            // Ids count up and wrap: those less than half the range behind the newest one are older.
             if newest.wrapping_sub(received) >= 0x8000 {
                 return Some(self.violated(bytes, Violation::Transaction { newest, received }));
             }
@@ -250,12 +249,12 @@ impl Client {
         }
     }
 
-    /// Gives up the request in flight, on the same connection: its answer will be skipped.
+    /// Gives up the request in flight on the same connection: its answer will be skipped.
     pub const fn abort(&mut self) {
         self.in_flight = false;
     }
 
-    /// Gives up the request in flight and forgets a partial answer, for a new connection.
+    /// Gives up the request in flight and drops a partial answer, for a new connection.
     pub const fn reset(&mut self) {
         self.in_flight = false;
         self.reader.reset();
@@ -273,5 +272,5 @@ fn no_space(parts: &RequestParts<'_>, available: usize) -> StartError {
     StartError::Encode(PduEncodeError::NoSpace { needed, available })
 }
 
-/// What a frame has before its data.
+/// Length of the part of a frame before its data.
 const HEADS_LEN: usize = FRONT_LEN + OPERANDS_LEN;

@@ -12,9 +12,9 @@ pub enum Exception {
     IllegalDataAddress,
     /// 0x03: a count, value or byte count the function does not allow.
     IllegalDataValue,
-    /// 0x04: the server failed while it carried the request out.
+    /// 0x04: the server failed while it executed the request.
     DeviceFailure,
-    /// 0x05: accepted, and still being carried out.
+    /// 0x05: accepted, and still being executed.
     Acknowledge,
     /// 0x06: busy with a long command; try again later.
     DeviceBusy,
@@ -24,11 +24,11 @@ pub enum Exception {
     GatewayPathUnavailable,
     /// 0x0B: the unit behind a Modbus gateway did not answer.
     GatewayTargetSilent,
-    /// Any other code, kept as it came.
+    /// Any other code, as received.
     Unknown(u8),
 }
 
-/// Codes and their exceptions; both directions read this one table.
+/// Codes with their exceptions, for both directions.
 const CODES: [(u8, Exception, &str); 9] = [
     (0x01, Exception::IllegalFunction, "illegal function"),
     (0x02, Exception::IllegalDataAddress, "illegal data address"),

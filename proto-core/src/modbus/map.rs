@@ -1,13 +1,13 @@
 //! The controller's address map (docs/wire/modbus.md sections 7 and 8).
 //!
-//! Addresses of system variables come from the table in [`crate::sysvar`]; the rest is listed here.
-//! The build fails if there is a gap between rows.
+//! Addresses of system variables come from the table in [`crate::sysvar`]; the others are listed here. The build fails
+//! if there is a gap between rows.
 
 use super::exception::Exception;
 
 mod rows;
 
-/// The two address spaces the controller has.
+/// The address spaces of the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Space {
@@ -59,7 +59,7 @@ impl MapRun {
     }
 }
 
-/// Checks that `count` items from `address` can be read.
+/// Checks that all `count` items from `address` on can be read.
 ///
 /// # Errors
 /// [`Exception::IllegalDataAddress`] if one of them is outside the map.
@@ -72,7 +72,7 @@ pub fn check_read(space: Space, address: u16, count: u16) -> Result<(), Exceptio
     if past <= u32::from(end) { Ok(()) } else { Err(Exception::IllegalDataAddress) }
 }
 
-/// Checks that `count` items from `address` can be written, all of them (D10).
+/// Checks that all `count` items from `address` on can be written (D10).
 ///
 /// # Errors
 /// [`Exception::IllegalDataAddress`] if one of them is outside the map or read-only.
@@ -88,25 +88,25 @@ pub fn check_write(space: Space, address: u16, count: u16) -> Result<(), Excepti
     }
 }
 
-/// `value` as a register of `per_unit` counts per unit: rounded to the nearest count, two's
-/// complement, saturated at ±32767, and 0 for a value that is not a number (D11).
+/// Converts `value` to a register of `per_unit` counts per unit: rounded to the nearest count, two's complement,
+/// saturated at ±32767, and 0 for NaN (D11).
 pub fn scaled(value: f32, per_unit: u16) -> u16 {
     let counts = f64::from(value) * f64::from(per_unit);
-    // The cast takes infinities to the ends of i32 and NaN to 0.
+    // The cast saturates infinities to the limits of i32 and turns NaN into 0.
     let nearest = (counts + 0.5_f64.copysign(counts)) as i32;
     nearest.clamp(-MAX_COUNTS, MAX_COUNTS) as i16 as u16
 }
 
-/// The value of a register of `per_unit` counts per unit.
+/// Converts a register of `per_unit` counts per unit to its value.
 pub fn unscaled(register: u16, per_unit: u16) -> f32 {
     f32::from(register as i16) / f32::from(per_unit.max(1))
 }
 
 const MAX_COUNTS: i32 = 32_767;
 
-/// For each coil: one past the end of the writable run it is in, or 0.
+/// For each coil: one past the end of the writable run that contains it, or 0 if it is read-only.
 static COIL_RUNS: [u16; COILS as usize] = rows::runs(Space::Coils);
-/// The same for each holding register.
+/// For each holding register: one past the end of its writable run, or 0.
 static HOLDING_RUNS: [u16; HOLDING as usize] = rows::runs(Space::Holding);
 
 #[cfg(test)]

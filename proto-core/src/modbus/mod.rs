@@ -1,9 +1,9 @@
-//! Modbus TCP, both sides, for the six function codes of the controller's map (docs/wire/modbus.md);
-//! Modbus RTU for lines of field devices is in [`rtu`].
+//! Modbus TCP, client and server, for the six function codes of the controller's map (docs/wire/modbus.md). [`rtu`] has
+//! Modbus RTU for serial lines with field devices.
 //!
-//! [`client::Client`] runs one transaction at a time and [`server::Server`] answers over a
-//! [`server::RegisterBank`]; both take received bytes in chunks of any size. [`map`] is the
-//! controller's address map. Timeouts, sockets and reconnecting belong to the caller.
+//! [`client::Client`] runs one transaction at a time and [`server::Server`] answers from a [`server::RegisterBank`];
+//! both take received bytes in chunks of any size. [`map`] is the controller's address map. Timeouts, sockets and
+//! reconnecting belong to the caller.
 //!
 //! ```
 //! use proto_core::modbus::client::{Client, ClientEvent};
@@ -28,7 +28,7 @@
 //! # Ok::<(), proto_core::modbus::client::StartError>(())
 //! ```
 //!
-//! No function of these modules can panic, whatever bytes it is given.
+//! No function of these modules can panic on any input.
 
 pub mod adu;
 pub mod client;

@@ -1,6 +1,6 @@
-//! What the PDUs of both sides are made of: operands, the data of a write, limits (docs/wire/modbus.md section 3).
+//! Parts of a PDU on both sides: operands, data of a write, limits (docs/wire/modbus.md section 3).
 //!
-//! In: the fields of a request. Out: its bytes behind the function code. Does not know connections.
+//! In: the fields of a request. Out: its bytes after the function code. Does not know connections.
 
 use core::fmt;
 
@@ -52,7 +52,7 @@ impl fmt::Display for PduEncodeError {
 
 impl core::error::Error for PduEncodeError {}
 
-/// What most PDUs have behind their function code: an address, and a count or value, as one number.
+/// The address, and the count or value, that follow most function codes, as one number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Operands(u32);
 
@@ -77,33 +77,33 @@ impl Operands {
         self.0 as u16
     }
 
-    /// The head of a request of `function`.
+    /// Combines the operands with a function code.
     pub(super) const fn of(self, function: u8) -> RequestHead {
         RequestHead { function, address: self.address(), count_or_value: self.count_or_value() }
     }
 }
 
-/// The contents of a request's PDU.
+/// The parts of a request's PDU.
 #[derive(Clone, Copy)]
 pub(super) struct RequestParts<'a> {
     pub(super) function: u8,
     pub(super) operands: Operands,
     /// Limit of the count, or [`NO_COUNT`].
     pub(super) max: u16,
-    /// The data of a multiple write, and how many of the highest bits of its last byte are sent as 0.
+    /// The data of a multiple write, and the number of unused highest bits in its last byte, which are sent as 0.
     pub(super) data: Option<(&'a [u8], u8)>,
-    /// Number of bytes behind the function code of the answer, if the request is carried out.
+    /// Number of bytes after the function code of a good answer.
     pub(super) answer_len: usize,
 }
 
 impl RequestParts<'_> {
-    /// The parts of a request without data, whose answer has its operands.
+    /// A request without data, whose answer repeats its operands.
     pub(super) const fn new(function: u8, address: u16, count_or_value: u16, max: u16) -> Self {
         let operands = Operands::new(address, count_or_value);
         Self { function, operands, max, data: None, answer_len: OPERANDS_LEN }
     }
 
-    /// Number of bytes behind the function code.
+    /// Number of bytes after the function code.
     pub(super) fn data_len(&self) -> usize {
         self.data.map_or(OPERANDS_LEN, |(data, _)| data.len().wrapping_add(OPERANDS_LEN + 1))
     }
@@ -118,14 +118,14 @@ impl RequestParts<'_> {
         }
     }
 
-    /// Writes what comes behind the function code to `out`, which is [`Self::data_len`] bytes long.
+    /// Writes the bytes after the function code to `out`, which is [`Self::data_len`] bytes long.
     pub(super) fn write(&self, out: &mut [u8]) {
         let Some((operands, rest)) = out.split_first_chunk_mut() else { return };
         *operands = self.operands.to_bytes();
         if let Some((data, unused)) = self.data
             && let Some((byte_count, target)) = rest.split_first_mut()
         {
-            // At most 246 bytes by the limits of the count.
+            // At most 246 bytes, because the count is limited.
             *byte_count = data.len() as u8;
             copy_cleared(data, unused, target);
         }
@@ -147,12 +147,13 @@ impl RequestParts<'_> {
     }
 }
 
-/// Copies `data` to `target`, which is as long, and clears the highest `unused` bits, at most 7, of its last byte.
+/// Copies `data` to `target`, which has the same length, and clears the highest `unused` bits (at most 7) of its last
+/// byte.
 pub(super) fn copy_cleared(data: &[u8], unused: u8, target: &mut [u8]) {
     match (&mut *target, data) {
         // Sixteen digital outputs, or one register.
         ([first, second], &[from, next]) => (*first, *second) = (from, next),
-        // Asked for here, where the compiler sees it.
+        // Checked here so the compiler knows that the lengths are equal.
         (target, data) if target.len() != data.len() => return,
         (target, data) if data.len() <= runs::MAX_RUN => runs::copy(target, data),
         (target, data) => target.copy_from_slice(data),
@@ -172,12 +173,11 @@ pub(super) const fn coil_value(on: bool) -> u16 {
     if on { COIL_ON } else { COIL_OFF }
 }
 
-/// Address, and count or value.
+/// Length of an address and a count or value.
 pub(super) const OPERANDS_LEN: usize = 4;
 
-/// In place of a limit, where the operand is a value.
+/// Used as the limit if the operand is a value.
 pub(super) const NO_COUNT: u16 = u16::MAX;
 
-/// The values of FC 5.
 pub(super) const COIL_OFF: u16 = 0x0000;
 pub(super) const COIL_ON: u16 = 0xFF00;

@@ -94,13 +94,13 @@ pub enum Request<'a> {
     },
 }
 
-/// A server's answer to a request that it carried out.
+/// A server's answer to a request that it executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Response<'a> {
-    /// FC 1: the coils asked for.
+    /// FC 1: the requested coils.
     Coils(Coils<'a>),
-    /// FC 3: the registers asked for.
+    /// FC 3: the requested registers.
     Registers(Registers<'a>),
     /// FC 5: an echo of the request.
     WroteCoil {
@@ -137,7 +137,7 @@ pub enum Response<'a> {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum ResponseError {
-    /// The function code of another function.
+    /// The answer has another function code.
     Function {
         /// The request's function code.
         expected: u8,
@@ -191,12 +191,11 @@ impl fmt::Display for ResponseError {
 impl core::error::Error for ResponseError {}
 
 impl<'a> Request<'a> {
-    /// Reads a request as a server does (D10).
+    /// Parses a request, as a server does (D10).
     ///
     /// # Errors
-    /// The exception to answer with: 01 for another function code, 03 for a count of 0 or over the
-    /// limit, an FC 5 value other than 0x0000 and 0xFF00, or a PDU whose length disagrees with its
-    /// function or byte count.
+    /// The exception to answer with: 01 for another function code; 03 for a count of 0 or over the limit, an FC 5 value
+    /// other than 0x0000 and 0xFF00, or a PDU whose length disagrees with its function or byte count.
     pub fn parse(pdu: &'a [u8]) -> Result<Self, Exception> {
         let (&function, data) = pdu.split_first().ok_or(Exception::IllegalFunction)?;
         let Some((operands, rest)) = data.split_first_chunk() else { return Err(refusal(function)) };
@@ -248,7 +247,7 @@ impl<'a> Request<'a> {
     /// Writes the request's PDU to the front of `out` and returns its length.
     ///
     /// # Errors
-    /// A count the function does not allow, or too little space; nothing is written then.
+    /// The count is outside the function's limits, or `out` is too short; nothing is written then.
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         self.parts().encode(out)
     }
@@ -283,11 +282,11 @@ impl<'a> Request<'a> {
 }
 
 impl<'a> Response<'a> {
-    /// The answer to a request of `function` that was carried out; `data` is what comes behind its
-    /// function code, of the length that the request asks for. `None` if it is not exactly that.
+    /// The answer to an executed request of `function`. `data` are the bytes after its function code; `None` if they do
+    /// not have exactly the expected length.
     pub(super) fn expected(function: u8, operands: Operands, data: &'a [u8]) -> Option<Self> {
         let (address, count_or_value) = (operands.address(), operands.count_or_value());
-        // By ranges, so that one comparison tells reads from writes: it is a function that a request can have.
+        // Ranges, so that one comparison tells reads from writes; `function` is valid here.
         match function {
             0..=function::READ_COILS => {
                 let (byte_count, packed) = data.split_first()?;
@@ -307,10 +306,10 @@ impl<'a> Response<'a> {
         }
     }
 
-    /// Reads the answer to `request`: a response, or the exception the server refused it with.
+    /// Parses the answer to `request`: a response, or the server's exception.
     ///
     /// # Errors
-    /// [`ResponseError`] when the bytes do not answer that request.
+    /// [`ResponseError`] if the bytes do not answer that request.
     pub fn parse(request: RequestHead, pdu: &'a [u8]) -> Result<Result<Self, Exception>, ResponseError> {
         match pdu.split_first() {
             Some((&received, data)) => Self::parse_data(request, received, data),
@@ -318,7 +317,7 @@ impl<'a> Response<'a> {
         }
     }
 
-    /// The same for the function code and what comes behind it.
+    /// Like [`Self::parse`], for a function code and the bytes after it.
     pub(super) fn parse_data(
         request: RequestHead,
         received: u8,
@@ -373,7 +372,7 @@ impl<'a> Response<'a> {
     /// Writes the response's PDU to the front of `out` and returns its length.
     ///
     /// # Errors
-    /// Too little space; nothing is written then.
+    /// `out` is too short; nothing is written then.
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         let (needed, available) = (self.encoded_len(), out.len());
         let no_space = PduEncodeError::NoSpace { needed, available };
@@ -411,12 +410,12 @@ impl RequestHead {
     }
 }
 
-/// The PDU that refuses a request of `function`.
+/// The exception response to a request of `function`.
 pub fn exception_pdu(function: u8, exception: Exception) -> [u8; 2] {
     [function | function::EXCEPTION_FLAG, exception.code()]
 }
 
-/// An echo of another length; a read of nothing or of too much, which no request asks for, has no answer at all.
+/// The error for an echo of the wrong length. Also for a read with an invalid count, which has no valid answer.
 fn unanswerable(data: &[u8]) -> ResponseError {
     ResponseError::Length { expected: HEAD_LEN, received: data.len().saturating_add(1) }
 }
@@ -431,7 +430,7 @@ fn parse_exception(function: u8, received: u8, data: &[u8]) -> Result<Exception,
     }
 }
 
-/// The data of a read's answer, `data` being everything after the function code.
+/// The data of a read's answer. `data` is everything after the function code.
 fn counted(data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
     match data.split_first() {
         Some((byte_count, _)) if usize::from(*byte_count) != expected => {
@@ -445,7 +444,7 @@ fn counted(data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
     }
 }
 
-/// What a server answers to a request that cannot be parsed: 03 when it knows the function.
+/// The exception for a request that cannot be parsed: 03 if the function is known, else 01.
 pub(super) fn refusal(function: u8) -> Exception {
     match function {
         function::READ_COILS
@@ -458,7 +457,7 @@ pub(super) fn refusal(function: u8) -> Exception {
     }
 }
 
-/// Function code and operands.
+/// Length of function code and operands.
 pub(super) const HEAD_LEN: usize = 5;
-/// Function code and byte count of a read's answer.
+/// Length of the function code and byte count in a read's answer.
 pub(super) const READ_HEAD_LEN: usize = 2;

@@ -1,7 +1,7 @@
-//! The server's side of one connection (docs/wire/modbus.md section 5).
+//! The server side of one connection (docs/wire/modbus.md section 5).
 //!
-//! In: a connection's bytes. Out: one answer for each request, from a [`RegisterBank`] that knows
-//! the map. Any unit id is answered and echoed (D10).
+//! In: a connection's bytes. Out: one answer for each request, from a [`RegisterBank`] that knows the map. Answers any
+//! unit id and echoes it (D10).
 
 use super::adu::{AduError, AduFrame, AduReader, FRONT_LEN, MAX_ADU, MAX_PDU};
 use super::exception::Exception;
@@ -13,13 +13,12 @@ use super::values::{Coils, MAX_READ_COILS, Registers, last_mask, packed_len};
 
 /// The registers behind a server.
 ///
-/// The server has checked counts and that `address + count` does not pass 65536. A bank answers
-/// [`Exception::IllegalDataAddress`] for anything outside its map or read-only, **before** it
-/// changes anything: each call happens whole or not at all (D12).
+/// The server has checked the count and that `address + count` is at most 65536. A bank returns
+/// [`Exception::IllegalDataAddress`] for addresses that are outside its map or read-only **before** it changes
+/// anything: each call succeeds or fails as a whole (D12).
 pub trait RegisterBank {
-    /// Writes `count` coils from `address` into `packed`, the first in the least significant bit of
-    /// the first byte. `packed` is all zero and just long enough; bits beyond the last coil are
-    /// cleared afterwards.
+    /// Writes `count` coils from `address` on into `packed`, the first in the least significant bit of the first byte.
+    /// `packed` is all zero and just long enough; bits beyond the last coil are cleared afterwards.
     ///
     /// # Errors
     /// The exception to answer with.
@@ -43,8 +42,8 @@ pub trait RegisterBank {
     /// The exception to answer with; nothing was changed.
     fn write_holding(&mut self, address: u16, registers: Registers<'_>) -> Result<(), Exception>;
 
-    /// FC 22: writes the register at `address`; the bits of `keep` stay as they are, the others become those of
-    /// `value`, which has no others. A bank without it has not this function.
+    /// FC 22: writes the register at `address`. Bits in `keep` stay unchanged; the others are taken from `value`, where
+    /// the bits in `keep` are 0. By default the function is not supported.
     ///
     /// # Errors
     /// The exception to answer with; nothing was changed.
@@ -52,7 +51,7 @@ pub trait RegisterBank {
         Err(Exception::IllegalFunction)
     }
 
-    /// Same as [`Self::read_coils`] for discrete inputs, FC 2. A bank without them has not this function.
+    /// Same as [`Self::read_coils`] for discrete inputs, FC 2. By default the function is not supported.
     ///
     /// # Errors
     /// The exception to answer with.
@@ -60,8 +59,7 @@ pub trait RegisterBank {
         Err(Exception::IllegalFunction)
     }
 
-    /// Same as [`Self::read_holding`] for input registers, FC 4. A bank without them has not this
-    /// function.
+    /// Same as [`Self::read_holding`] for input registers, FC 4. By default the function is not supported.
     ///
     /// # Errors
     /// The exception to answer with.
@@ -70,7 +68,7 @@ pub trait RegisterBank {
     }
 }
 
-/// The server's side of one connection.
+/// The server side of one connection.
 #[derive(Debug, Clone, Default)]
 pub struct Server {
     reader: AduReader,
@@ -82,12 +80,11 @@ impl Server {
         Self { reader: AduReader::new() }
     }
 
-    /// Takes one request from the front of `bytes`, carries it out on `bank`, writes the answer to
-    /// the front of `out` and returns its length. Call it until it returns `None`, which means that
-    /// all of `bytes` has been taken.
+    /// Takes one request from the front of `bytes`, executes it on `bank`, writes the answer to the front of `out` and
+    /// returns its length. Call it until it returns `None`: then all of `bytes` is taken.
     ///
     /// # Errors
-    /// The connection must be closed (D10); the rest of its bytes is dropped.
+    /// The connection must be closed (D10); the rest of `bytes` is dropped.
     pub fn receive<B: RegisterBank + ?Sized>(
         &mut self,
         bytes: &mut &[u8],
@@ -114,15 +111,14 @@ impl Server {
         Some(Ok(len.wrapping_add(FRONT_LEN)))
     }
 
-    /// Forgets a partial request, for a new connection.
+    /// Drops a partial request, for a new connection.
     pub const fn reset(&mut self) {
         self.reader.reset();
     }
 }
 
-/// Carries out the request in `pdu`, writes the answer's PDU to `out` and returns its length.
-///
-/// For other framings of PDUs; [`Server`] calls it for each frame.
+/// Executes the request in `pdu`, writes the answer's PDU to `out` and returns its length. [`Server`] calls it for each
+/// frame; it also serves other framings.
 pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8; MAX_PDU]) -> usize {
     let (&asked, data) = pdu.split_first().unwrap_or((&0, &[]));
     let Some((function, body)) = out.split_first_mut() else { return 0 };
@@ -135,16 +131,16 @@ pub fn answer<B: RegisterBank + ?Sized>(pdu: &[u8], bank: &mut B, out: &mut [u8;
     answer.data_len.wrapping_add(1)
 }
 
-/// What an answer begins with, and how many bytes come behind that.
+/// Front of an answer, and the number of bytes after it.
 struct ResponseStart {
     function: u8,
     data_len: usize,
 }
 
-/// What comes behind a function code.
+/// The bytes after a function code.
 type ResponseBody = [u8; MAX_PDU - 1];
 
-/// Another function, or an exception.
+/// Handles the other functions, and builds exceptions.
 fn others<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
@@ -169,7 +165,7 @@ fn others<B: RegisterBank + ?Sized>(
     ResponseStart { function, data_len: 1 }
 }
 
-/// FC 22, which is answered by its data. Another length is none of this function.
+/// FC 22: the answer repeats the request's data. Another length is refused.
 fn write_masked<B: RegisterBank + ?Sized>(
     data: &[u8],
     bank: &mut B,
@@ -183,7 +179,7 @@ fn write_masked<B: RegisterBank + ?Sized>(
     Ok(request.len())
 }
 
-/// FC 2 and 4, which a client of this project never asks.
+/// FC 2 and 4, which this project's client never sends.
 fn read_inputs<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
@@ -198,7 +194,7 @@ fn read_inputs<B: RegisterBank + ?Sized>(
         function::READ_INPUT => MAX_READ_REGISTERS,
         _ => return Err(Exception::IllegalFunction),
     };
-    // Whether there is the function is asked before its count and address.
+    // The function is checked before count and address.
     match function {
         function::READ_DISCRETE => bank.read_discrete(address, 0, &mut [])?,
         _ => bank.read_input(address, &mut [])?,
@@ -213,10 +209,10 @@ fn read_inputs<B: RegisterBank + ?Sized>(
     }
 }
 
-/// Carries out a request, of which `data` is what comes behind its function code, and writes what comes behind the
-/// answer's. Returns how much that is.
-// Without a value that can be any request: it would be written and taken apart again. What a request must have is asked
-// by its length first, because that is known to be right for both reads and for both writes then.
+/// Executes a request. `data` are its bytes after the function code; those of the answer are written to `out`, and
+/// their number is returned.
+// Does not build a `Request`, which would be stored and taken apart again. Branches on the length first, which is
+// checked once for both reads and for both multiple writes.
 fn carry_out<B: RegisterBank + ?Sized>(
     function: u8,
     data: &[u8],
@@ -250,7 +246,7 @@ fn carry_out<B: RegisterBank + ?Sized>(
     } else {
         write_one(function, operands, bank)?;
     }
-    // Every write is answered by its operands.
+    // Every write is answered with its operands.
     *out.first_chunk_mut().ok_or(Exception::DeviceFailure)? = operands.to_bytes();
     Ok(OPERANDS_LEN)
 }
@@ -275,7 +271,7 @@ fn write_one<B: RegisterBank + ?Sized>(
     }
 }
 
-/// Byte count and packed bits of an answer; returns how many bytes that is. `read` gets them cleared.
+/// Writes byte count and packed bits of an answer and returns their length. `read` gets the bits cleared.
 fn read_bits(
     out: &mut ResponseBody,
     count: u16,
@@ -290,7 +286,7 @@ fn read_bits(
     Ok(packed.len().saturating_add(1))
 }
 
-/// The same for registers.
+/// Writes byte count and registers of an answer and returns their length.
 fn read_words(
     out: &mut ResponseBody,
     count: u16,
@@ -301,15 +297,15 @@ fn read_words(
     Ok(bytes.len().saturating_add(1))
 }
 
-/// The byte count of a read's answer; returns the place for the data.
+/// Writes the byte count of a read's answer and returns the space for the data.
 fn read_answer(out: &mut ResponseBody, len: usize) -> Result<&mut [u8], Exception> {
     let (byte_count, data) = out.split_first_mut().ok_or(Exception::DeviceFailure)?;
-    // At most 250 bytes by the limits of the count.
+    // At most 250 bytes, because the count is limited.
     *byte_count = len as u8;
     data.get_mut(..len).ok_or(Exception::DeviceFailure)
 }
 
-/// Addresses are 16 bits: a run beyond the last one is outside every map.
+/// Addresses have 16 bits: a run that exceeds them is outside every map.
 fn check_end(address: u16, count: u16) -> Result<(), Exception> {
     let end = u32::from(address).wrapping_add(u32::from(count));
     if end <= ADDRESSES { Ok(()) } else { Err(Exception::IllegalDataAddress) }

@@ -31,7 +31,7 @@ impl RegisterBank for Bank {
         for (nth, _) in coils.iter().enumerate().filter(|(_, on)| **on) {
             packed[nth / 8] |= 1 << (nth % 8);
         }
-        // What lies beyond the last coil is the server's business.
+        // The server clears the bits beyond the last coil.
         if !count.is_multiple_of(8) {
             *packed.last_mut().unwrap() |= 0x80;
         }
@@ -64,7 +64,7 @@ impl RegisterBank for Bank {
     }
 }
 
-/// The answer's PDU to a request's PDU.
+/// The PDU of the answer to a request.
 fn ask(bank: &mut Bank, pdu: &[u8]) -> Vec<u8> {
     let mut out = [0xA5; MAX_PDU];
     let len = answer(pdu, bank, &mut out);
@@ -81,7 +81,7 @@ fn refused(pdu: &[u8], exception: Exception) {
     assert_eq!(bank, Bank::default(), "a refused request changed the bank");
 }
 
-/// Everything a server answers to `stream`, handed over in pieces of at most `chunk` bytes.
+/// All answers of a server to `stream`, passed in pieces of at most `chunk` bytes.
 fn serve(bank: &mut Bank, stream: &[u8], chunk: usize) -> Result<Vec<u8>, AduError> {
     let (mut server, mut sent) = (Server::new(), Vec::new());
     for mut bytes in stream.chunks(chunk) {
@@ -551,7 +551,7 @@ fn coils_are_copied_without_the_bits_beyond_the_last() {
     }
 }
 
-/// The only answer that is taken at a glance is the right one: any other is what it is when it comes in pieces.
+/// The fast path accepts only the right answer; anything else gives the same result as in pieces.
 #[test]
 fn an_answer_in_one_piece_is_what_it_is_in_two() {
     let (on, words) = ([0x5A, 0x03], [0, 1, 0, 2]);

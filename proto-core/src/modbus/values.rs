@@ -1,5 +1,4 @@
-//! Coils and registers as they are in a PDU: borrowed, length-checked views (docs/wire/modbus.md
-//! section 3).
+//! Coils and registers of a PDU: borrowed, length-checked views (docs/wire/modbus.md section 3).
 
 use super::parts::copy_cleared;
 
@@ -17,8 +16,7 @@ pub struct Coils<'a> {
 }
 
 impl<'a> Coils<'a> {
-    /// The first `count` coils of `packed`; `None` when `count` is 0 or over 2000, or `packed` is too
-    /// short.
+    /// The first `count` coils of `packed`; `None` when `count` is 0 or over 2000, or `packed` is too short.
     pub fn new(packed: &'a [u8], count: u16) -> Option<Self> {
         if count == 0 || count > MAX_READ_COILS {
             return None;
@@ -26,14 +24,13 @@ impl<'a> Coils<'a> {
         packed.get(..packed_len(count)).map(|packed| Self { packed, count })
     }
 
-    /// The `count` coils that `packed` holds, in exactly as many bytes as they take.
+    /// The `count` coils in `packed`, which must have exactly the bytes for them.
     pub(super) fn exact(packed: &'a [u8], count: u16) -> Option<Self> {
         let fits = count != 0 && count <= MAX_READ_COILS && packed.len() == packed_len(count);
         fits.then_some(Self { packed, count })
     }
 
-    /// The `count` coils of an answer, in exactly as many bytes as they take. Both were checked by whoever sent the
-    /// request, and its answer's length.
+    /// The `count` coils of an answer. The sender of the request checked the count, and the length of `packed`.
     pub(super) const fn of_request(packed: &'a [u8], count: u16) -> Self {
         Self { packed, count }
     }
@@ -74,8 +71,8 @@ impl<'a> Coils<'a> {
         (0..self.count).map_while(move |nth| self.coil(nth))
     }
 
-    /// Up to eight coils from `first` on as one byte, the first in the least significant bit: a
-    /// byte variable of the map. `None` if `first` is beyond the last coil.
+    /// Up to eight coils from `first` on as one byte, as byte variables of the map; the first coil is the least
+    /// significant bit. `None` if `first` is beyond the last coil.
     pub fn byte(self, first: u16) -> Option<u8> {
         let left = self.count.checked_sub(first).filter(|left| *left != 0)?;
         let at = usize::from(first >> 3);
@@ -85,8 +82,8 @@ impl<'a> Coils<'a> {
         Some(if left < 8 { byte & last_mask(left) } else { byte })
     }
 
-    /// Writes the packed coils to the front of `bytes`, the bits beyond the last one as 0, and returns how many bytes
-    /// that are; `None`, with nothing written, if it is too short.
+    /// Writes the packed coils to the front of `bytes`, with the bits beyond the last coil as 0, and returns their
+    /// number of bytes; `None`, with nothing written, if `bytes` is too short.
     pub fn copy_to(self, bytes: &mut [u8]) -> Option<usize> {
         let target = bytes.get_mut(..self.packed.len())?;
         copy_cleared(self.packed, self.unused(), target);
@@ -98,12 +95,12 @@ impl<'a> Coils<'a> {
         self.packed
     }
 
-    /// Number of bits of the last packed byte that are no coils: its highest ones.
+    /// Number of unused bits, the highest ones, in the last packed byte.
     pub(super) const fn unused(self) -> u8 {
         self.count.wrapping_neg() as u8 & 7
     }
 
-    /// The bits of the last packed byte that are coils.
+    /// Mask of the used bits in the last packed byte.
     pub const fn last_mask(self) -> u8 {
         last_mask(self.count)
     }
@@ -141,13 +138,13 @@ impl<'a> Registers<'a> {
         Some(Self { bytes })
     }
 
-    /// The `count` registers that `bytes` holds, in exactly as many bytes as they take.
+    /// The `count` registers in `bytes`, which must have exactly the bytes for them.
     pub(super) fn exact(bytes: &'a [u8], count: u16) -> Option<Self> {
         let len = usize::from(count).saturating_mul(2);
         (len != 0 && len <= MAX_REGISTER_BYTES && bytes.len() == len).then_some(Self { bytes })
     }
 
-    /// The registers of an answer, as many bytes as the request asks for: its sender has checked the count.
+    /// The registers of an answer, whose length the sender of the request has checked.
     pub(super) const fn of_request(bytes: &'a [u8]) -> Self {
         Self { bytes }
     }
@@ -164,8 +161,8 @@ impl<'a> Registers<'a> {
         Self::new(words.as_flattened().get(..count.saturating_mul(2))?)
     }
 
-    /// Turns little-endian words, as in the process image, into registers in the front of `buffer`;
-    /// `None` in the same cases as [`Registers::pack`].
+    /// Converts little-endian words, as in the process image, into registers at the front of `buffer`; `None` in the
+    /// same cases as [`Registers::pack`].
     pub fn from_little_endian(words: &[u8], buffer: &'a mut [u8]) -> Option<Self> {
         let (words, odd) = words.as_chunks::<2>();
         if !odd.is_empty() {
@@ -207,9 +204,9 @@ impl<'a> Registers<'a> {
     }
 }
 
-/// Turns as many registers as there are words.
-// Pieces of a fixed size are vector operations without a loop for what is left over: the last words are turned together
-// with some that are turned anyway.
+/// Converts as many registers as there are words.
+// Pieces of a fixed size become vector operations. Instead of a loop for the remainder, the last registers are
+// converted as a piece that overlaps others.
 fn turn(registers: &[[u8; 2]], words: &mut [u16]) {
     let (Some(last), true) = (registers.last_chunk(), registers.len() == words.len()) else {
         return registers.iter().zip(words).for_each(|(from, to)| *to = u16::from_be_bytes(*from));
@@ -227,12 +224,12 @@ fn turn(registers: &[[u8; 2]], words: &mut [u16]) {
     }
 }
 
-// All are read before any is written: so they need not be known to lie apart.
+// Reads all before it writes any, so the compiler need not prove that the slices do not overlap.
 fn turn_piece<const N: usize>(registers: &[[u8; 2]; N], words: &mut [u16; N]) {
     *words = registers.map(u16::from_be_bytes);
 }
 
-/// A vector's registers, and two vectors'.
+/// Registers of one vector; the full piece has two.
 const HALF: usize = 8;
 const PIECE: usize = 16;
 
@@ -241,9 +238,9 @@ pub(super) const fn packed_len(count: u16) -> usize {
     count.div_ceil(8) as usize
 }
 
-/// The bits of the last packed byte of `count` coils that are coils.
+/// Mask of the used bits in the last byte of `count` packed coils.
 pub(super) const fn last_mask(count: u16) -> u8 {
-    // As many bits are unused as are missing to the next multiple of 8.
+    // The number of unused bits is the distance to the next multiple of 8.
     0xFF_u8 >> (count.wrapping_neg() & 7)
 }
 

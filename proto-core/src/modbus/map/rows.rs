@@ -40,7 +40,7 @@ pub(super) const ROWS: [MapRun; 27] = [
 ];
 
 impl MapRun {
-    /// More addresses than the variables have bits: the rest is reserved.
+    /// For a row with more addresses than the variables have bits; the rest is reserved.
     const fn widened(self, count: u16) -> Self {
         Self { count, ..self }
     }
@@ -58,7 +58,7 @@ const fn other(space: Space, first: u16, count: u16, content: &'static str) -> M
     MapRun { space, first, count, access: Access::ReadOnly, content, per_unit: 0 }
 }
 
-/// The row of the variable table that begins with `group[index]`.
+/// The row of the variables from `group[index]` on.
 const fn variables(group: &str, index: u8, content: &'static str) -> MapRun {
     let mut nth = 0;
     while !(SPANS[nth].first == index && same(SPANS[nth].group, group)) {
@@ -79,7 +79,7 @@ const fn variables(group: &str, index: u8, content: &'static str) -> MapRun {
     }
 }
 
-/// Inputs of the robot are what a client may write; they are the first rows.
+/// Clients may write the robot's inputs, which are the first rows.
 const fn access(row: usize) -> Access {
     let (mut nth, mut before) = (0, 0);
     while nth < row {
@@ -114,7 +114,7 @@ pub(super) const fn end(space: Space) -> u16 {
 pub(super) const fn runs<const N: usize>(space: Space) -> [u16; N] {
     let mut runs = [0; N];
     let (mut row, mut run_end) = (ROWS.len(), 0);
-    // Backwards, so that a run that goes on into the next row is known when its first row comes.
+    // Backwards, to know whether a run continues in the next row.
     while row > 0 {
         row -= 1;
         let item = ROWS[row];

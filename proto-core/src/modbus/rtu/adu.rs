@@ -1,7 +1,7 @@
 //! The Modbus RTU frame: address, PDU, CRC (docs/wire/modbus-rtu.md section 1).
 //!
-//! In: a frame's bytes, or what it is to contain. Out: the other, and how long a frame is by its
-//! first bytes. Does not know silence, transactions or the meaning of a function.
+//! In: a frame's bytes, or its contents. Out: the other, and the length of a frame from its first bytes. Does not know
+//! silence, transactions or the meaning of a function.
 
 use core::fmt;
 
@@ -12,9 +12,9 @@ use crate::device::Algorithm;
 pub const MAX_ADU: usize = MAX_PDU + OVERHEAD;
 /// Shortest frame: address, function code, CRC.
 pub const MIN_ADU: usize = 4;
-/// The address of a request to all slaves, which none answers.
+/// Address of a broadcast: a request to all slaves, which is not answered.
 pub const BROADCAST: u8 = 0;
-/// The highest address that a slave can have; those above are reserved.
+/// Highest address of a slave; those above are reserved.
 pub const MAX_ADDRESS: u8 = 247;
 
 /// Bytes of the CRC, low byte first.
@@ -22,11 +22,11 @@ pub(crate) const CRC_LEN: usize = 2;
 /// Address and CRC.
 const OVERHEAD: usize = 1 + CRC_LEN;
 
-/// A frame whose CRC is right.
+/// A frame with a right CRC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Adu<'a> {
-    /// The slave that is asked or answers, or [`BROADCAST`].
+    /// The slave that is asked or that answers, or [`BROADCAST`].
     pub address: u8,
     /// Function code and data, 1..=253 bytes.
     pub pdu: &'a [u8],
@@ -42,7 +42,7 @@ pub enum AduError {
         /// Number of bytes.
         received: usize,
     },
-    /// The CRC is another than that of the bytes before it.
+    /// The CRC does not match the bytes before it.
     Checksum {
         /// The CRC of the bytes.
         expected: u16,
@@ -64,15 +64,15 @@ impl fmt::Display for AduError {
 
 impl core::error::Error for AduError {}
 
-/// What the first bytes of a frame say of its length.
+/// The length of a frame, as far as its first bytes show it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum FrameLen {
-    /// The whole frame has so many bytes, CRC included; at most 256.
+    /// Length of the whole frame in bytes, CRC included; at most 256.
     Known(usize),
-    /// The first so many bytes must be known first.
+    /// This many bytes of the frame are needed to know the length.
     NeedsBytes(usize),
-    /// A function without known length, or a byte count that no frame has room for.
+    /// The function's length is not known, or the byte count is too large for a frame.
     Unknown,
 }
 
@@ -80,7 +80,7 @@ impl<'a> Adu<'a> {
     /// Checks that `frame` is one whole frame.
     ///
     /// # Errors
-    /// A length that no frame has, or a wrong CRC.
+    /// An invalid length or a wrong CRC.
     pub fn parse(frame: &'a [u8]) -> Result<Self, AduError> {
         let length = AduError::Length { received: frame.len() };
         if !(MIN_ADU..=MAX_ADU).contains(&frame.len()) {
@@ -103,7 +103,7 @@ impl<'a> Adu<'a> {
     /// Writes the frame to the front of `out` and returns its length.
     ///
     /// # Errors
-    /// Too little space; nothing is written then.
+    /// `out` is too short; nothing is written then.
     pub fn encode(&self, out: &mut [u8]) -> Result<usize, PduEncodeError> {
         let (needed, available) = (self.encoded_len(), out.len());
         let no_space = PduEncodeError::NoSpace { needed, available };
@@ -116,26 +116,25 @@ impl<'a> Adu<'a> {
     }
 }
 
-/// The CRC of these bytes; it is sent low byte first.
+/// The CRC of `bytes`; it is sent low byte first.
 pub fn checksum(bytes: &[u8]) -> u16 {
-    // Of 16 bits by its width.
+    // A CRC of width 16 fits.
     Algorithm::CRC16_MODBUS.of([bytes]) as u16
 }
 
-/// Whether `frame` ends with the CRC of what is before it.
+/// Whether `frame` ends with the CRC of the bytes before it.
 pub(super) fn is_right(frame: &[u8]) -> bool {
     Adu::parse(frame).is_ok()
 }
 
-/// Puts the CRC behind the first `len` bytes and returns the length with it; `None` if there is no
-/// room.
+/// Appends the CRC to the first `len` bytes and returns the new length; `None` if there is no space.
 pub(super) fn seal(frame: &mut [u8], len: usize) -> Option<usize> {
     let (checked, rest) = frame.split_at_mut_checked(len)?;
     *rest.first_chunk_mut::<CRC_LEN>()? = checksum(checked).to_le_bytes();
     len.checked_add(CRC_LEN)
 }
 
-/// The length of a request by its first bytes, address first: function codes 1-6, 15, 16, 22 and 23.
+/// Length of a request from its first bytes, address first: function codes 1-6, 15, 16, 22 and 23.
 pub fn request_len(frame: &[u8]) -> FrameLen {
     match frame.get(1) {
         None => FrameLen::NeedsBytes(2),
@@ -154,8 +153,7 @@ pub fn request_len(frame: &[u8]) -> FrameLen {
     }
 }
 
-/// The length of a reply by its first bytes, address first: function codes 1-6, 15, 16, 22 and 23, and
-/// exceptions.
+/// Length of a reply from its first bytes, address first: function codes 1-6, 15, 16, 22 and 23, and exceptions.
 pub fn reply_len(frame: &[u8]) -> FrameLen {
     match frame.get(1) {
         None => FrameLen::NeedsBytes(2),
@@ -178,7 +176,7 @@ pub fn reply_len(frame: &[u8]) -> FrameLen {
     }
 }
 
-/// The length of a frame whose byte count is at `at`, with the data behind it.
+/// Length of a frame whose byte count is at offset `at`, followed by the data.
 fn counted(frame: &[u8], at: usize) -> FrameLen {
     let head = at.saturating_add(1);
     match frame.get(at) {

@@ -1,11 +1,11 @@
-//! Modbus RTU: frames, what a master asks, and the slave (docs/wire/modbus-rtu.md).
+//! Modbus RTU: frames, a master's operations, and the slave (docs/wire/modbus-rtu.md).
 //!
-//! An [`Operation`] is what a master asks, with the lengths of its request and reply; the engine asks it
-//! ([`config::ExchangeBuilder`](crate::config::ExchangeBuilder)). [`Slave`] answers as one address over a
-//! [`RegisterBank`](super::server::RegisterBank): it takes received bytes in chunks of any size, and the time.
+//! An [`Operation`] is a request of a master without its values, with the lengths of request and reply; the engine
+//! sends it ([`config::ExchangeBuilder`](crate::config::ExchangeBuilder)). [`Slave`] answers for one address from a
+//! [`RegisterBank`](super::server::RegisterBank); it takes received bytes in chunks of any size, and the time.
 //!
-//! No function of these modules can panic, whatever bytes it is given, and each is bounded: one
-//! frame is held, and each received byte is looked at a bounded number of times.
+//! No function of these modules can panic on any input, and their work is bounded: one frame is held, and each received
+//! byte is examined a bounded number of times.
 
 mod adu;
 mod operation;
@@ -21,19 +21,19 @@ pub(crate) use operation::{Expected, Probe, REFUSAL_LEN};
 pub use slave::{Slave, SlaveStats};
 pub use timing::Timing;
 
-/// Most slaves that a master asks on one line.
+/// Maximum number of slaves per line for a master.
 pub const MAX_SLAVES: usize = 32;
 
-/// Whether a line gives back what was sent on it.
+/// Whether the receiver of a line also hears what is sent on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Echo {
-    /// Only others are heard.
+    /// It does not.
     #[default]
     Absent,
-    /// Each own byte is heard, as with a 2-wire adapter whose receiver is always on. A reply is
-    /// looked for only behind the echo of its request: replies of FC 5 and 6 look like requests.
+    /// It hears each byte that is sent, as with a 2-wire adapter whose receiver is always on. A reply is searched only
+    /// after the echo of its request, because replies of FC 5 and 6 look like their requests.
     Heard,
 }
 

@@ -1,7 +1,7 @@
-//! What a master asks of a slave, and which reply answers it (docs/wire/modbus-rtu.md section 3).
+//! Requests of a master, and how their replies are recognised (docs/wire/modbus-rtu.md section 3).
 //!
-//! In: an operation and the data to write. Out: the request's frame, and what its reply must look
-//! like. Does not know when it is asked.
+//! In: an operation and the data to write. Out: the request's frame, and what its reply must look like. Does not know
+//! when requests are sent.
 
 use core::{fmt, slice};
 
@@ -14,7 +14,7 @@ use super::super::values::{last_mask, packed_len};
 use super::adu::{BROADCAST, MAX_ADU, is_right, seal};
 use crate::sysvar::Direction;
 
-/// A function with its addresses and counts, and without values.
+/// A function with its addresses and counts, but without values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -82,7 +82,7 @@ pub enum Operation {
         /// 1..=121.
         write_count: u16,
     },
-    /// FC 22: writes bits of one register; the slave keeps the others.
+    /// FC 22: writes some bits of one register and keeps the others.
     MaskWriteRegister {
         /// The register.
         address: u16,
@@ -91,7 +91,7 @@ pub enum Operation {
     },
 }
 
-/// A count that a function does not allow.
+/// A count that the function does not allow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct CountError {
@@ -124,8 +124,8 @@ pub enum Table {
 }
 
 impl Operation {
-    /// The operation of a function, with address and count of what it reads, then of what it writes, and with the bits
-    /// that FC 22 writes; `None` for another function.
+    /// The operation with this function code; `read` and `written` are address and count of what it reads and writes,
+    /// `mask` is for FC 22. `None` for any other function code.
     pub const fn of_function(code: u8, read: (u16, u16), written: (u16, u16), mask: u16) -> Option<Self> {
         let ((read_address, read_count), (write_address, write_count)) = (read, written);
         let (address, count) = read;
@@ -146,8 +146,8 @@ impl Operation {
         })
     }
 
-    /// The operation on all of a block of the gateway as a slave: a master writes its fields, if they are an input part,
-    /// and reads them otherwise.
+    /// The operation of a master on a whole block that the gateway serves as a slave: a write if the block's fields are
+    /// an input part, else a read.
     pub const fn of_block(table: Table, fields: Direction, address: u16, count: u16) -> Self {
         match (table, fields) {
             (Table::Coils, Direction::Input) => Self::WriteCoils { address, count },
@@ -175,7 +175,7 @@ impl Operation {
         }
     }
 
-    /// Whether the bytes of a good reply are those of the request, as an echo of the line has them.
+    /// Whether a good reply has the same bytes as the request, like an echo of the line.
     pub const fn is_repeated_by_reply(&self) -> bool {
         matches!(self, Self::WriteCoil { .. } | Self::WriteRegister { .. } | Self::MaskWriteRegister { .. })
     }
@@ -209,9 +209,9 @@ impl Operation {
         if count == 0 || count > max { Err(CountError { count, max }) } else { Ok(()) }
     }
 
-    /// Bytes of data that a request needs: 0 for a read; 1 for one coil, whose lowest bit counts;
-    /// coils packed eight per byte with the first in the lowest bit; two bytes a register, high
-    /// byte first. Of FC 22 the register with those bits that are written.
+    /// Bytes of data in a request: 0 for a read; 1 for one coil, of which the lowest bit counts; coils packed eight per
+    /// byte with the first in the lowest bit; two bytes per register, high byte first. For FC 22, the register with the
+    /// written bits.
     pub const fn written_len(&self) -> usize {
         match *self {
             Self::WriteCoil { .. } => 1,
@@ -232,7 +232,7 @@ impl Operation {
         }
     }
 
-    /// The table that it is about, its first address there and the count; what FC 23 reads.
+    /// Table, first address and count; for FC 23, of the registers that it reads.
     pub const fn place(&self) -> (Table, u16, u16) {
         let table = match self {
             Self::ReadCoils { .. } | Self::WriteCoil { .. } | Self::WriteCoils { .. } => Table::Coils,
@@ -259,7 +259,7 @@ impl Operation {
         }
     }
 
-    /// Length of the frame of a reply that is no exception.
+    /// Length of the frame of a good reply.
     pub const fn reply_len(&self) -> usize {
         match self.reply_data_len() {
             Some(len) => len.saturating_add(5),
@@ -267,7 +267,7 @@ impl Operation {
         }
     }
 
-    /// Bytes of data in the reply; `None` for one that echoes the request's head.
+    /// Bytes of data in the reply; `None` for a reply that repeats the operands.
     const fn reply_data_len(&self) -> Option<usize> {
         match *self {
             Self::ReadCoils { count, .. } | Self::ReadDiscreteInputs { count, .. } => Some(packed_len(count)),
@@ -278,8 +278,8 @@ impl Operation {
         }
     }
 
-    /// First address and count as they are in the request; FC 5 and 6 have the value there, FC 22 the bits that the
-    /// slave keeps.
+    /// First address and count in the request. FC 5 and 6 have the value in place of the count, FC 22 the mask of the
+    /// kept bits.
     const fn head(&self) -> (u16, u16) {
         match *self {
             Self::ReadCoils { address, count }
@@ -294,8 +294,8 @@ impl Operation {
         }
     }
 
-    /// Writes the request's frame to the front of `out` and returns its length. `fill` writes the
-    /// data into a slice of [`Self::written_len`] zeros; `None` if it has none.
+    /// Writes the request's frame to the front of `out` and returns its length. `fill` writes the data into
+    /// [`Self::written_len`] zeros; `None` if it has no data.
     pub(crate) fn encode(
         &self,
         slave: u8,
@@ -358,10 +358,10 @@ impl Operation {
     }
 }
 
-/// The byte count and the zeroed place of `len` bytes of data behind it.
+/// Writes the byte count `len` and returns the zeroed space for the data after it.
 fn behind_count(rest: &mut [u8], len: usize) -> Option<&mut [u8]> {
     let (byte_count, data) = rest.split_first_mut()?;
-    // At most 246 by the limits of the counts.
+    // At most 246, because the counts are limited.
     *byte_count = len as u8;
     let data = data.get_mut(..len)?;
     data.fill(0);
@@ -369,8 +369,8 @@ fn behind_count(rest: &mut [u8], len: usize) -> Option<&mut [u8]> {
 }
 
 impl Operation {
-    /// Whether a good reply to this request can be one to the other, of the same slave. What is written into one
-    /// register or coil is in the reply, and tells two writes with different values apart; here they count as alike.
+    /// Whether a good reply to `self` could be mistaken for one to `other`, sent to the same slave. Replies of FC 5 and
+    /// 6 contain the written value, which may differ; it is ignored here.
     pub(crate) fn is_answered_like(&self, other: &Self) -> bool {
         if self.function() != other.function() {
             return false;
@@ -392,54 +392,54 @@ pub(crate) struct Expected {
 
 #[derive(Debug, Clone, Copy)]
 enum Body {
-    /// So many bytes of data behind their count.
+    /// This many bytes of data after the byte count.
     Data(u8),
-    /// The same bytes as in the request: four, of FC 22 six.
+    /// The same bytes as in the request: four, or six for FC 22.
     Echo([u8; 6]),
 }
 
-/// How many bytes of a request behind its function are in the reply too, if that has no data.
+/// Number of bytes after the function code that a reply without data repeats from the request.
 const fn repeated_len(function: u8) -> usize {
     if function == function::MASK_WRITE_REGISTER { 6 } else { 4 }
 }
 
-/// What bytes are to a master that waits for a reply.
+/// How received bytes look to a master that waits for a reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Probe {
     /// Not the beginning of the reply.
     No,
-    /// Perhaps its beginning.
+    /// Possibly the beginning of the reply.
     Partial,
-    /// The reply, of so many bytes.
+    /// The reply; its length.
     Reply(usize),
     /// The request is refused.
     Refused(Exception),
-    /// The reply by its head and length, with a wrong CRC.
+    /// The reply by head and length, but with a wrong CRC.
     Wrong,
 }
 
 impl Expected {
-    /// What answers the request in `frame`; `None` for a broadcast.
+    /// The expected reply to the request in `frame`; `None` for a broadcast.
     pub(crate) fn of(operation: &Operation, frame: &[u8]) -> Option<Self> {
         let (&[slave, function], rest) = frame.split_first_chunk()?;
         if slave == BROADCAST {
             return None;
         }
         let body = match operation.reply_data_len() {
-            // At most 250 by the limits of the counts.
+            // At most 250, because the counts are limited.
             Some(len) => Body::Data(len as u8),
-            // Of four bytes, what is behind them is not looked at; every request has a CRC there.
+            // If only four bytes are repeated, the other two are ignored; every request has a CRC there.
             None => Body::Echo(*rest.first_chunk()?),
         };
         Some(Self { slave, function, body })
     }
 
-    /// The bytes behind the function that are those of the request, of a reply without data.
+    /// The bytes after the function code that a reply without data must repeat.
     fn repeated<'a>(&self, head: &'a [u8; 6]) -> &'a [u8] {
         head.get(..repeated_len(self.function)).unwrap_or(head)
     }
 
-    /// Length of the frame that `bytes` begin, if it is not refused.
+    /// Length of the frame that `bytes` begin, unless it is an exception.
     pub(crate) fn len_of(&self, bytes: &[u8]) -> usize {
         match (bytes.get(1), self.body) {
             (Some(function), _) if *function == self.function | function::EXCEPTION_FLAG => REFUSAL_LEN,
@@ -448,8 +448,7 @@ impl Expected {
         }
     }
 
-    /// Whether a whole frame without its CRC is the reply, or else says that the request is refused; `None` if it is
-    /// neither.
+    /// Judges a whole frame without its CRC: true for the reply, false for an exception, `None` for neither.
     pub(crate) fn judge(&self, frame: &[u8]) -> Option<bool> {
         let (&[slave, function], rest) = frame.split_first_chunk()?;
         if slave != self.slave {
@@ -467,7 +466,7 @@ impl Expected {
         (function == self.function && fits).then_some(true)
     }
 
-    /// What `bytes` begin with.
+    /// Judges the frame that `bytes` begin.
     pub(crate) fn probe(&self, bytes: &[u8]) -> Probe {
         let [slave, rest @ ..] = bytes else { return Probe::Partial };
         if *slave != self.slave {
@@ -500,10 +499,10 @@ impl Expected {
     }
 }
 
-/// Length of the frame of an exception.
+/// Length of an exception's frame.
 pub(crate) const REFUSAL_LEN: usize = 5;
 
-/// Length of the frame of a request with FC 22, and of its good reply.
+/// Length of the frame of an FC 22 request, and of its good reply.
 const MASK_WRITE_LEN: usize = 10;
 
 /// High byte of the value that switches a coil on.

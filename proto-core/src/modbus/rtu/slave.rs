@@ -1,4 +1,4 @@
-//! A slave that answers as one address (docs/wire/modbus-rtu.md section 6).
+//! A slave that answers for one address (docs/wire/modbus-rtu.md section 6).
 //!
 //! In: the bytes of a line, the time, a [`RegisterBank`]. Out: replies. Does not know the map.
 
@@ -10,13 +10,13 @@ use crate::time::Instant;
 
 /// A slave on a line.
 ///
-/// To be called: [`Self::received`] with bytes, and after it and when [`Self::deadline`] has come,
-/// [`Self::poll`], whose reply is to be sent at once.
+/// Call [`Self::received`] with bytes. After that, and when [`Self::deadline`] is reached, call [`Self::poll`] and send
+/// its reply at once.
 ///
-/// The silence of the line ends a frame. Where the caller saw no silence between frames, as behind
-/// an operating system, they are told apart by their lengths. Only the newest request is answered:
-/// for an earlier one the master no longer waits. One byte 0x00 or 0xFF before the frames of a burst
-/// and one behind them, as a line gives while its direction changes, are no part of them.
+/// Silence ends a burst of frames. If the caller saw no silence between frames, as behind an operating system, their
+/// lengths separate them. Only the newest request is answered: the master no longer waits for earlier ones. One byte
+/// 0x00 or 0xFF before and one after the frames of a burst is ignored: lines produce them while their direction
+/// changes.
 #[derive(Debug, Clone)]
 pub struct Slave {
     timing: Timing,
@@ -24,34 +24,34 @@ pub struct Slave {
     address: u8,
     buffer: [u8; BUFFER],
     len: usize,
-    /// More bytes came without a silence than there is room for.
+    /// More bytes arrived without a silence than the buffer holds.
     overrun: bool,
     heard: Instant,
-    /// Length and CRC of the own reply, whose echo comes first.
+    /// Length and CRC of the reply that was sent, whose echo comes first.
     sent: Option<(usize, [u8; CRC_LEN])>,
-    /// Length of a reply that is kept in the buffer, and is sent later.
+    /// Length of a reply that is kept in the buffer until it can be sent.
     kept: usize,
     counters: SlaveStats,
 }
 
-/// Frames that came without a silence between them.
+/// Holds several frames that came without a silence between them.
 const BUFFER: usize = 2 * MAX_ADU;
 
-/// Counters of a slave since the start; they stop at their end.
+/// Counters of a slave since the start; they saturate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct SlaveStats {
-    /// Requests that were answered, with those that were refused.
+    /// Answered requests, refused ones included.
     pub answered: u32,
     /// Requests that were refused with an exception.
     pub refused: u32,
-    /// Broadcasts that were carried out.
+    /// Executed broadcasts.
     pub broadcasts: u32,
     /// Frames of the other slaves, requests and replies.
     pub others: u32,
-    /// Requests that were not carried out, because more came behind them.
+    /// Requests that were not executed because more bytes followed.
     pub late: u32,
-    /// Bursts with bytes that are no frame or have a wrong CRC.
+    /// Bursts that contain something other than valid frames.
     pub wrong: u32,
 }
 
@@ -75,13 +75,13 @@ impl Slave {
         })
     }
 
-    /// Takes bytes that came from the line by `now`. If the line was silent before them and
-    /// [`Self::poll`] was not called, what came earlier is too old to be answered.
+    /// Takes bytes that were received by `now`. If the line was silent before them and [`Self::poll`] was not called,
+    /// the earlier bytes are too old to be answered.
     pub fn received(&mut self, bytes: &[u8], now: Instant) {
         if bytes.is_empty() {
             return;
         }
-        // The line goes on: a reply that was not sent is too late.
+        // More bytes arrived: an unsent reply is too late.
         self.kept = 0;
         let began = now - self.timing.of(bytes.len());
         if self.len != 0 && began >= self.heard + self.timing.silence() {
@@ -98,8 +98,8 @@ impl Slave {
         self.len = self.len.saturating_add(taken);
     }
 
-    /// Carries out what was asked once the line is silent; the length of the reply in `out`, or
-    /// `None` if there is nothing to send.
+    /// Once the line is silent, executes the request and writes the reply to `out`. Returns its length, or `None` if
+    /// there is nothing to send.
     pub fn poll<B: RegisterBank + ?Sized>(
         &mut self,
         now: Instant,
@@ -118,12 +118,12 @@ impl Slave {
         reply
     }
 
-    /// When to call [`Self::poll`]; [`Instant::NEVER`] while nothing has come.
+    /// When to call [`Self::poll`]; [`Instant::NEVER`] if no bytes are waiting.
     pub fn deadline(&self) -> Instant {
         if self.len == 0 { Instant::NEVER } else { self.heard + self.timing.silence() }
     }
 
-    /// Copies the bytes that came to the front of `out`, as many as fit, and returns how many.
+    /// Copies the received bytes, as many as fit, to the front of `out` and returns how many.
     pub(crate) fn copy_to(&self, out: &mut [u8]) -> usize {
         let held = self.buffer.iter().take(self.len);
         out.iter_mut().zip(held).map(|(slot, &byte)| *slot = byte).count()
@@ -138,15 +138,15 @@ impl Slave {
         self.kept > 0
     }
 
-    /// Takes the reply that was kept, if there is one.
+    /// Takes a kept reply.
     pub(crate) fn take_kept(&mut self, out: &mut [u8]) -> Option<usize> {
         let kept = self.buffer.iter().take(core::mem::take(&mut self.kept));
         let len = out.iter_mut().zip(kept).map(|(slot, &byte)| *slot = byte).count();
         (len > 0).then_some(len)
     }
 
-    /// Drops what came and what was to be sent: the line is gone, or nobody knows how old it is. Returns
-    /// the number of bytes that came.
+    /// Drops received bytes and an unsent reply, because the line is gone or their age is unknown. Returns the number
+    /// of received bytes.
     pub(crate) fn discard(&mut self) -> usize {
         let len = self.len;
         self.forget();
@@ -163,7 +163,7 @@ impl Slave {
         (self.len, self.overrun, self.sent) = (0, false, None);
     }
 
-    /// Goes through the frames of a burst.
+    /// Processes the frames of a burst.
     fn carry_out<B: RegisterBank + ?Sized>(
         &mut self,
         bank: &mut B,
@@ -187,7 +187,7 @@ impl Slave {
             && bare.explains(inner)
         {
             if bare.first_frame(rest).is_some() && reading.explains(rest) {
-                // Nobody can tell which of the two was sent.
+                // It is ambiguous which of the two was sent.
                 counters.wrong = counters.wrong.saturating_add(1);
                 return None;
             }
@@ -201,7 +201,7 @@ impl Slave {
             rest = behind;
             match Adu::parse(frame) {
                 Ok(Adu { address: BROADCAST, pdu }) if writes(pdu) => {
-                    // None answers, not even with an exception.
+                    // A broadcast is never answered, not even with an exception.
                     answer(pdu, bank, pdu_of(out)?);
                     counters.broadcasts = counters.broadcasts.saturating_add(1);
                 }
@@ -229,18 +229,17 @@ impl Slave {
     }
 }
 
-/// How the bytes of a burst are taken for frames.
+/// How the bytes of a burst are split into frames.
 #[derive(Debug, Clone, Copy)]
 struct BurstReading {
-    /// The address of the slave.
+    /// Address of this slave.
     own: u8,
-    /// A byte before them was dropped, so a frame counts only with the length that its function and
-    /// byte count say.
+    /// A byte was dropped, so a frame only counts if its length is the one given by its function and byte count.
     is_bare: bool,
 }
 
 impl BurstReading {
-    /// Whether `bytes` are frames and nothing else, but for a false byte behind them.
+    /// Whether `bytes` consist of frames only, except for a stray byte at the end.
     fn explains(self, mut bytes: &[u8]) -> bool {
         while let Some((_, behind)) = self.first_frame(bytes) {
             if behind.is_empty() {
@@ -251,14 +250,14 @@ impl BurstReading {
         false
     }
 
-    /// The frame at the front of `bytes`, with a right CRC, and what is behind it: all of them, or what
-    /// the function and the byte count say of a request or reply. A single false byte behind it is
-    /// dropped, but for a frame to this slave only if its length is a request's.
+    /// Splits off the frame at the front of `bytes`, which has a right CRC: all bytes, or the length that function and
+    /// byte count give for a request or reply. A stray byte after it is dropped; if the frame is for this slave, only
+    /// if it has a request's length.
     fn first_frame(self, bytes: &[u8]) -> Option<(&[u8], &[u8])> {
         let is_for_this = bytes.first().is_some_and(|&address| address == self.own || address == BROADCAST);
         let (whole, request, reply) = (FrameLen::Known(bytes.len()), request_len(bytes), reply_len(bytes));
-        // The CRC of a frame with 0x00 behind it is right as well. So what is to be carried out is looked
-        // for first with a request's length, and of two lengths the shorter one is tried first.
+        // A frame followed by 0x00 also has a right CRC. So frames to execute are tried with a request's length first,
+        // and of two lengths the shorter one is tried first.
         let (first, second) = match (request, reply) {
             (FrameLen::Known(request_len), FrameLen::Known(reply_len)) if reply_len < request_len => {
                 (reply, request)
@@ -280,12 +279,12 @@ impl BurstReading {
     }
 }
 
-/// Whether this is what a line gives while its direction changes.
+/// Whether a line may produce this byte while its direction changes.
 const fn is_stray(byte: u8) -> bool {
     matches!(byte, 0x00 | 0xFF)
 }
 
-/// What is behind a false byte at the front.
+/// The bytes after a stray byte at the front.
 fn without_stray(bytes: &[u8]) -> Option<&[u8]> {
     bytes.split_first().filter(|(first, _)| is_stray(**first)).map(|(_, inner)| inner)
 }
@@ -303,7 +302,7 @@ fn writes(pdu: &[u8]) -> bool {
     )
 }
 
-/// The place of the PDU in a frame.
+/// The space for the PDU in a frame.
 fn pdu_of(out: &mut [u8; MAX_ADU]) -> Option<&mut [u8; MAX_PDU]> {
     out.split_first_mut()?.1.first_chunk_mut()
 }
