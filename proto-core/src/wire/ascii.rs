@@ -1,7 +1,7 @@
 //! Splitting text at ASCII characters.
 //!
-//! Same as the methods of `str`, which cannot be shown not to panic: they search for the encoding
-//! of a `char`, whose length the compiler cannot follow.
+//! Like the methods of `str`, but provably without panics: those search for an encoded `char`, whose length the
+//! compiler does not know.
 
 /// The text before and after the first `separator`, an ASCII character.
 pub(crate) fn split_once(text: &str, separator: u8) -> Option<(&str, &str)> {

@@ -1,7 +1,7 @@
 //! A classic CAN frame and its id.
 //!
-//! A frame cannot be made with an id that does not fit its kind, or with more data than
-//! [`MAX_CAN_DATA`]. Which frames are used is decided by a recipe ([`crate::recipe::CanLayout`]).
+//! A frame always has an id that fits its kind, and at most [`MAX_CAN_DATA`] bytes of data. A recipe decides which
+//! frames are used ([`crate::recipe::CanLayout`]).
 
 use core::fmt;
 
@@ -27,14 +27,14 @@ pub enum CanId {
 pub struct CanFrame {
     key: CanKey,
     remote: bool,
-    /// The data length code: what a remote frame asks for.
+    /// The data length code; for a remote frame, the requested length.
     dlc: u8,
     /// Bytes of data; none in a remote frame.
     len: u8,
     data: [u8; MAX_CAN_DATA],
 }
 
-/// An id in one word, so that ids are compared and looked up without asking for their kind.
+/// An id with its kind in one word, for comparison and lookup.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) struct CanKey(u32);
 
@@ -42,7 +42,7 @@ pub(crate) struct CanKey(u32);
 const EXTENDED: u32 = 1 << 31;
 
 impl CanKey {
-    /// No id has it.
+    /// Not a valid id.
     pub(crate) const NONE: Self = Self(u32::MAX);
 
     pub(crate) const fn of(id: CanId) -> Self {
@@ -107,7 +107,7 @@ impl From<embedded_can::Id> for CanId {
 }
 
 impl CanFrame {
-    /// A data frame; `None` when the id is too large for its kind or there are more than 8 bytes.
+    /// A data frame; `None` if the id is too large for its kind or `data` has more than 8 bytes.
     pub fn new(id: CanId, data: &[u8]) -> Option<Self> {
         let len = data.len() as u8;
         let key = CanKey::of(id);
@@ -116,15 +116,14 @@ impl CanFrame {
         id.is_valid().then_some(frame)
     }
 
-    /// A remote frame that asks for `len` bytes; `None` when the id is too large for its kind or `len`
-    /// is more than 8.
+    /// A remote frame that requests `len` bytes; `None` if the id is too large for its kind or `len` is more than 8.
     pub fn remote(id: CanId, len: usize) -> Option<Self> {
         let (key, fits) = (CanKey::of(id), id.is_valid() && len <= MAX_CAN_DATA);
         fits.then_some(Self { key, remote: true, dlc: len as u8, len: 0, data: [0; MAX_CAN_DATA] })
     }
 
-    /// A data frame of `len` bytes, which `fill` writes. The caller has checked that the id is
-    /// valid and `len` at most [`MAX_CAN_DATA`].
+    /// A data frame of `len` bytes written by `fill`. The caller has checked that the id is valid and `len` at most
+    /// [`MAX_CAN_DATA`].
     pub(crate) fn filled(id: CanId, len: u8, fill: impl FnOnce(&mut [u8])) -> Self {
         let mut data = [0; MAX_CAN_DATA];
         if let Some(used) = data.get_mut(..usize::from(len)) {
@@ -133,8 +132,7 @@ impl CanFrame {
         Self { key: CanKey::of(id), remote: false, dlc: len, len, data }
     }
 
-    /// A data frame of the first [`MAX_CAN_DATA`] of these bytes. The caller has checked that the id
-    /// is valid.
+    /// A data frame of the first [`MAX_CAN_DATA`] bytes of `bytes`. The caller has checked that the id is valid.
     pub(crate) fn cut(id: CanId, bytes: &[u8]) -> Self {
         Self::filled(id, bytes.len().min(MAX_CAN_DATA) as u8, |data| {
             for (slot, &byte) in data.iter_mut().zip(bytes) {
@@ -148,7 +146,7 @@ impl CanFrame {
         self.key.id()
     }
 
-    /// The same in one word.
+    /// The frame's id in one word.
     pub(crate) const fn key(&self) -> CanKey {
         self.key
     }
@@ -165,7 +163,7 @@ impl CanFrame {
 
     /// The data; empty in a remote frame.
     pub fn data(&self) -> &[u8] {
-        // There are never more, which the compiler does not know.
+        // `len` never exceeds the maximum, but the compiler does not know this.
         self.data.get(..self.len().min(MAX_CAN_DATA)).unwrap_or(&[])
     }
 }

@@ -1,7 +1,7 @@
-//! The four state machines' codes (docs/wire/state.md section 4): the same numbers in the state
-//! packet, in Modbus holding registers 0..=3 and in the reply to `state`.
+//! Codes of the four state machines (docs/wire/state.md section 4). They are the same in the state packet, in Modbus
+//! holding registers 0..=3 and in the reply to `state`.
 
-/// An enum of codes with a place for the unknown ones, both directions from one table.
+/// Defines an enum of codes with a variant for unknown ones, and both conversions from one table.
 macro_rules! codes {
     ($(#[$meta:meta])* $name:ident { $($(#[$doc:meta])* $code:literal = $variant:ident,)* } $(also { $($(#[$also_doc:meta])* $also_code:literal = $also:ident,)* })?) => {
         $(#[$meta])*
@@ -23,7 +23,7 @@ macro_rules! codes {
                 }
             }
 
-            /// The state in words, such as `PowerOff`; `Unknown` for a code this table does not have.
+            /// The state's name, such as `PowerOff`; `Unknown` for a code that is not in this table.
             pub const fn name(self) -> &'static str {
                 match self {
                     $(Self::$variant => stringify!($variant),)*
@@ -74,7 +74,7 @@ codes! {
         /// SR_Enable: can move.
         6 = Enable,
     } also {
-        /// SR_Update, which later controller versions have (see
+        /// SR_Update, in later controller versions (see
         /// [`Dialect::robot_state`](crate::wire::dialect::Dialect::robot_state)).
         7 = Update,
     }
@@ -133,7 +133,7 @@ codes! {
     }
 }
 
-/// The four state machines together.
+/// The states of all four state machines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct States {

@@ -1,8 +1,7 @@
-//! Differences between controller versions, as data (docs/wire/command.md section 7,
-//! docs/wire/state.md section 6).
+//! Differences between controller versions, as data (docs/wire/command.md section 7, docs/wire/state.md section 6).
 //!
-//! In: a version's name. Out: a [`Dialect`], a plain struct of choices. Nothing here looks at a
-//! connection: a dialect is configured, never guessed from the controller's answers.
+//! In: a version's name. Out: a [`Dialect`], a plain struct of choices. Does not know connections: a dialect is
+//! configured, never guessed from the controller's answers.
 
 use super::codes::{OperationMode, ProgramState, RobotState, SafetyState, States};
 
@@ -49,7 +48,7 @@ pub enum Quotes {
     Double,
 }
 
-/// A controller's answer to a `run` that it carries out.
+/// A controller's answer to a `run` that it executes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum RunReply {
@@ -59,7 +58,7 @@ pub enum RunReply {
     Success,
 }
 
-/// A controller's answer to a `speed` that it carries out.
+/// A controller's answer to a `speed` that it executes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum SpeedReply {
@@ -69,8 +68,8 @@ pub enum SpeedReply {
     Percent,
 }
 
-/// A controller's answer to `poweron`, `poweroff`, `enable` or `disable` of which nothing is left to
-/// do.
+/// A controller's answer to `poweron`, `poweroff`, `enable` or `disable` in a state in which nothing remains to be
+/// done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum RepeatReply {
@@ -84,13 +83,13 @@ pub enum RepeatReply {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum FinishNotice {
-    /// It does not; clients ask with `isprogfinish`.
+    /// No; clients ask with `isprogfinish`.
     Silent,
     /// `script finish`, to the client that started the program, without being asked.
     ScriptFinish,
 }
 
-/// How holding register 0 shows the operation mode.
+/// How holding register 0 encodes the operation mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ModeRegister {
@@ -100,7 +99,7 @@ pub enum ModeRegister {
     UnitsDigit,
 }
 
-/// Whether a controller moves its arm, or only computes the motion.
+/// Whether a controller moves its arm or only simulates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Motion {
@@ -117,27 +116,27 @@ pub enum Motion {
 pub struct Dialect {
     /// The name used in configuration files.
     pub name: &'static str,
-    /// What a client ends its commands with. A server takes all of them (D2).
+    /// Terminator of a client's commands. A server accepts all of them (D2).
     pub terminator: Terminator,
-    /// What a client writes after a bare keyword. A server takes both (D2).
+    /// Whether a client writes parentheses after a bare keyword. A server accepts both (D2).
     pub parentheses: Parentheses,
-    /// How a client writes the program's name. A server takes both (D3).
+    /// How a client writes the program's name. A server accepts both (D3).
     pub quotes: Quotes,
-    /// What a server ends its replies with. A client takes all of them (D4).
+    /// Terminator of a server's replies. A client accepts all of them (D4).
     pub reply_terminator: Terminator,
-    /// A server's answer to a good `run`. A client takes both.
+    /// A server's answer to a good `run`. A client accepts both.
     pub run_reply: RunReply,
-    /// A server's answer to a good `speed`. A client takes both.
+    /// A server's answer to a good `speed`. A client accepts both.
     pub speed_reply: SpeedReply,
-    /// A server's answer to a command for the state that is there. A client takes both.
+    /// A server's answer to a command for the state that is already reached. A client accepts both.
     pub repeat_reply: RepeatReply,
-    /// Whether a server sends `script finish`. A client always takes it.
+    /// Whether a server sends `script finish`. A client always accepts it.
     pub finish_notice: FinishNotice,
     /// The safety state's code for "updating firmware" (SS_UPDATE): 15 or 99.
     pub safety_update: u8,
     /// The robot state's code for "updating" (SR_Update), where the version has one.
     pub robot_update: Option<u8>,
-    /// What holding register 0 holds.
+    /// How holding register 0 encodes the mode.
     pub mode_register: ModeRegister,
     /// TCP port of the Modbus server unless the configuration says otherwise.
     pub modbus_port: u16,
@@ -148,7 +147,7 @@ pub struct Dialect {
 }
 
 impl Dialect {
-    /// Controller software V2.3, as its interface description V1.5 has it.
+    /// Controller software V2.3, as in its interface description V1.5.
     pub const V2_3: Self = Self {
         name: "v2.3",
         terminator: Terminator::None,
@@ -167,8 +166,8 @@ impl Dialect {
         global_speed: None,
     };
 
-    /// Everything that was reported of later versions. No single release is known to do all of it;
-    /// as a client's dialect it is as safe as V2.3, since a client takes every form of a reply.
+    /// Everything reported of later versions. No single release is known to have all of it; for a client it is as safe
+    /// as V2.3, because a client accepts every form of a reply.
     pub const V2_6: Self = Self {
         name: "v2.6",
         terminator: Terminator::CrLf,
@@ -213,8 +212,7 @@ impl Dialect {
         if self.robot_update == Some(code) { RobotState::Update } else { RobotState::from_code(code) }
     }
 
-    /// This version's code for `state`. If the version has no code for an update, it is the later
-    /// versions' 7.
+    /// This version's code for `state`. For an update it is 7, as in later versions, if the version has no code for it.
     pub fn robot_code(&self, state: RobotState) -> u8 {
         match state {
             RobotState::Update => self.robot_update.unwrap_or(RobotState::Update.code()),
@@ -228,7 +226,7 @@ impl Dialect {
             return SafetyState::Update;
         }
         match SafetyState::from_code(code) {
-            // The code of another version: its meaning in this one is not known.
+            // A code of another version: unknown in this one.
             SafetyState::Update => SafetyState::Unknown(code),
             other => other,
         }
@@ -251,7 +249,7 @@ impl Dialect {
         }
     }
 
-    /// The operation mode for a value of holding register 0.
+    /// Operation mode and motion from a value of holding register 0.
     pub fn mode_from_register(&self, register: u16) -> (OperationMode, Motion) {
         match self.mode_register {
             ModeRegister::Code => {

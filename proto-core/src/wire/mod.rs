@@ -1,7 +1,6 @@
-//! Stateless conversions between bytes and values. Time, connections and configuration are not
-//! known here.
+//! Stateless conversions between bytes and values. Does not know time, connections or configuration.
 //!
-//! No function of this module can panic, whatever bytes it gets.
+//! No function of this module can panic on any input.
 
 pub(crate) mod ascii;
 pub mod can;

@@ -1,8 +1,7 @@
 //! Copies and checks of a few bytes whose number is known only at run time.
 //!
-//! Both take words from either end that overlap in the middle. For the short runs of recipes that
-//! is several times less work than a call of `memcpy` or a loop over bytes, here and on a
-//! Cortex-M.
+//! They use one word from each end; the words overlap in the middle. For the short runs of recipes this takes several
+//! times fewer instructions than a call of `memcpy` or a loop over bytes, on a host and on a Cortex-M.
 
 /// The longest run.
 pub(crate) const MAX_RUN: usize = 32;
@@ -11,7 +10,7 @@ pub(crate) const MAX_RUN: usize = 32;
 pub(crate) fn copy(to: &mut [u8], from: &[u8]) {
     debug_assert!(to.len() == from.len() && from.len() <= MAX_RUN);
     match from.len() {
-        // As one number: an array of sixteen bytes is a call of `memcpy` on a Cortex-M.
+        // As one number, because copying an array of 16 bytes calls `memcpy` on a Cortex-M.
         16.. => both_ends(to, from, |bytes| u128::from_ne_bytes(bytes).to_ne_bytes()),
         8.. => both_ends(to, from, as_is::<8>),
         4.. => both_ends(to, from, as_is::<4>),
@@ -20,9 +19,9 @@ pub(crate) fn copy(to: &mut [u8], from: &[u8]) {
     }
 }
 
-/// Copies a piece of any length to one of the same length, by runs: on a Cortex-M half the work of `memcpy`, which
-/// moves one word at a time.
-// Its cost is in docs/performance.md section 1, as that of the other attributes here.
+/// Copies a slice of any length to one of the same length, in runs. On a Cortex-M it takes half the time of `memcpy`,
+/// which moves one word at a time.
+// docs/performance.md section 1 has the cost of this attribute and the others here.
 #[inline(never)]
 pub(crate) fn copy_long(to: &mut [u8], from: &[u8]) {
     let (to_runs, to_rest) = to.as_chunks_mut::<16>();
@@ -58,8 +57,7 @@ fn both_ends<const N: usize>(to: &mut [u8], from: &[u8], by: impl Fn([u8; N]) ->
     }
 }
 
-/// Whether none of the binary32 numbers in `run`, at most [`MAX_RUN`] bytes, is infinite or not a
-/// number.
+/// Whether all binary32 numbers in `run`, at most [`MAX_RUN`] bytes, are finite.
 pub(crate) fn all_finite(run: &[u8]) -> bool {
     debug_assert!(run.len() <= MAX_RUN && run.len().is_multiple_of(4));
     match run.len() {
@@ -70,13 +68,13 @@ pub(crate) fn all_finite(run: &[u8]) -> bool {
     }
 }
 
-/// The same and [`copy`] in one; nothing is copied unless all numbers are finite.
+/// Checks and copies in one: like [`copy`], but copies nothing unless all numbers are finite.
 #[inline(always)]
 pub(crate) fn copy_finite(to: &mut [u8], run: &[u8]) -> bool {
     debug_assert!(to.len() == run.len() && run.len() <= MAX_RUN && run.len().is_multiple_of(4));
     match run.len() {
         16.. => finite_ends::<16>(run).is_some_and(|(&front, &back)| {
-            // Both before one is stored, so that they stay in the registers in which they were checked.
+            // Loads both before it stores one, so they stay in the registers in which they were checked.
             let (front, back) = (u128::from_ne_bytes(front), u128::from_ne_bytes(back));
             if let Some(target) = to.first_chunk_mut() {
                 *target = front.to_ne_bytes();
@@ -90,7 +88,7 @@ pub(crate) fn copy_finite(to: &mut [u8], run: &[u8]) -> bool {
             both_ends(to, run, as_is::<8>);
             true
         }),
-        // Both ends are the same.
+        // Both ends are the same bytes.
         8 => one_end::<8>(to, run),
         4.. => one_end::<4>(to, run),
         _ => true,
@@ -107,17 +105,17 @@ fn one_end<const N: usize>(to: &mut [u8], run: &[u8]) -> bool {
     }
 }
 
-/// The numbers in the first and in the last bytes of a run, which overlap, if all are finite.
+/// The first and the last bytes of a run, which may overlap, if all their numbers are finite.
 #[inline(always)]
 fn finite_ends<const N: usize>(run: &[u8]) -> Option<(&[u8; N], &[u8; N])> {
     let (front, back) = (run.first_chunk::<N>()?, run.last_chunk::<N>()?);
     let numbers = front.as_chunks().0.iter().zip(back.as_chunks().0);
-    // Looking at all of them without a branch for each is one vector operation.
+    // Without a branch for each number, this is one vector operation.
     let special = numbers.fold(false, |any, (&front, &back)| any | is_special(front) | is_special(back));
     (!special).then_some((front, back))
 }
 
-/// Whether all bits of the number's exponent are set: adding one to it then carries into the sign.
+/// Whether all exponent bits are set (infinity or NaN): adding one to the exponent then carries into the sign.
 fn is_special(float: [u8; 4]) -> bool {
     ((u32::from_le_bytes(float) & EXPONENT).wrapping_add(EXPONENT_UNIT) as i32) < 0
 }

@@ -6,7 +6,7 @@ use core::fmt;
 
 use crate::decimal::Decimal;
 
-/// A field's data type, with the specification's names.
+/// A field's data type; the variants have the specification's names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -66,7 +66,7 @@ impl ScalarType {
         }
     }
 
-    /// The type with this name, if there is one.
+    /// The type with this name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|ty| ty.name() == name)
     }
@@ -115,7 +115,7 @@ pub enum Scalar {
     Double(f64),
 }
 
-/// Why a number does not fit in a [`ScalarType`].
+/// Why a number does not fit a [`ScalarType`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum ScalarError {
@@ -197,7 +197,7 @@ impl Scalar {
         }
     }
 
-    /// The value as a number; exact for every type.
+    /// The value as a number, which is exact for every type.
     pub const fn as_f64(self) -> f64 {
         match self {
             Self::Byte(v) => v as f64,
@@ -211,8 +211,8 @@ impl Scalar {
         }
     }
 
-    /// `value` as a scalar of type `ty`, refused if it does not fit exactly: an integer type takes
-    /// only integers. A `float` takes the nearest binary32.
+    /// Converts `value` to type `ty`. A `float` takes the nearest binary32; an integer type takes only integers in its
+    /// range.
     ///
     /// # Errors
     /// [`ScalarError`] names the type and the number.
@@ -235,7 +235,7 @@ impl Scalar {
         if whole == value { Ok(scalar) } else { Err(ScalarError::NotWhole { ty, value }) }
     }
 
-    /// False for a float or double that is infinite or not a number; true for everything else.
+    /// Whether the value is finite; always true for integers.
     pub const fn is_finite(self) -> bool {
         match self {
             Self::Float(v) => v.is_finite(),

@@ -1,8 +1,8 @@
 //! The adapter's side of slcan, the serial-line CAN protocol (docs/wire/slcan.md).
 //!
-//! In: bytes of one client, and frames of the bus. Out: frames for the bus and answers for the
-//! client, and lines for the client. Does not know devices, buses or clocks. It is used by
-//! `host-sim`'s bus, and by boards with a serial line in place of a CAN controller.
+//! In: bytes of one client, and frames of the bus. Out: frames for the bus; answers and frame lines for the client.
+//! Does not know devices, buses or clocks. Used by `host-sim`'s bus, and by boards with a serial line in place of a CAN
+//! controller.
 
 use core::fmt;
 
@@ -10,8 +10,7 @@ use heapless::Vec;
 
 use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 
-/// Longest line without its CR: `T`, 8 digits of id, the length, 16 digits of data, 4 of time
-/// (section 2).
+/// Longest line without its CR: `T`, 8 digits of id, 1 of length, 16 of data, 4 of time (section 2).
 pub const MAX_LINE: usize = 30;
 
 /// A line with its CR.
@@ -67,14 +66,12 @@ impl Channel {
         self.refused
     }
 
-    /// Records that a frame of the bus could not be kept for the client; the status reports it
-    /// once.
+    /// Records that a frame of the bus was dropped because the client's buffer was full; the status reports it once.
     pub fn note_overrun(&mut self) {
         self.overrun = true;
     }
 
-    /// Takes bytes up to the end of the next line that is not empty. Call it until it returns
-    /// `None`.
+    /// Takes bytes up to the end of the next line that is not empty. Call it until it returns `None`.
     pub fn receive(&mut self, bytes: &mut &[u8]) -> Option<Reaction> {
         while let Some((&byte, rest)) = bytes.split_first() {
             *bytes = rest;
@@ -89,7 +86,7 @@ impl Channel {
                     self.refused = self.refused.saturating_add(u64::from(reaction == Reaction::REFUSED));
                     return Some(reaction);
                 }
-                // From a client that ends its lines with CR LF.
+                // Some clients end lines with CR LF.
                 b'\n' => {}
                 _ => self.overlong |= self.line.push(byte).is_err(),
             }
@@ -97,8 +94,7 @@ impl Channel {
         None
     }
 
-    /// The line that reports a frame on the bus at `millis` to the client; `None` while the channel
-    /// is closed.
+    /// The line that reports a frame on the bus at `millis` to the client; `None` if the channel is closed.
     pub fn deliver(&self, frame: &CanFrame, millis: u64) -> Option<SlcanLine> {
         let open = self.state != ChannelState::Closed;
         let stamp = u16::try_from(millis % TIMESTAMP_MODULUS).unwrap_or(0);
@@ -136,7 +132,7 @@ impl Channel {
                 self.timestamps = line == b"Z1";
                 Reaction::DONE
             }
-            // Frames are always passed on without a request.
+            // Frames are always forwarded without polling.
             b"X1" => Reaction::DONE,
             b"V" => Reaction::answer(b"V1013\r"),
             b"v" => Reaction::answer(b"v1013\r"),
@@ -174,7 +170,7 @@ impl Reaction {
     }
 }
 
-/// Why a line is not a frame.
+/// Why a line is not a valid frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum LineError {
@@ -201,7 +197,7 @@ impl fmt::Display for LineError {
 
 impl core::error::Error for LineError {}
 
-/// Reads a frame's line, without its CR (section 2). A timestamp after the frame is accepted.
+/// Parses a frame's line without its CR (section 2). A timestamp after the frame is accepted.
 ///
 /// # Errors
 /// See [`LineError`].
@@ -236,14 +232,14 @@ pub fn decode(line: &[u8]) -> Result<CanFrame, LineError> {
     if remote { CanFrame::remote(id, len) } else { CanFrame::new(id, &data) }.ok_or(LineError::Id)
 }
 
-/// Writes a frame's line with its CR, and the time in milliseconds within a minute when given.
+/// Formats a frame's line with its CR, and with the time in milliseconds within a minute if given.
 pub fn encode(frame: &CanFrame, timestamp: Option<u16>) -> SlcanLine {
     let mut line = SlcanLine::new();
     let (kind, id, digits) = match frame.id() {
         CanId::Standard(id) => (if frame.is_remote() { b'r' } else { b't' }, u32::from(id), 3),
         CanId::Extended(id) => (if frame.is_remote() { b'R' } else { b'T' }, id, 8),
     };
-    // MAX_LINE holds the longest line, so no push is refused.
+    // The capacity is MAX_LINE, so no push fails.
     let _ = line.push(kind);
     push_hex(&mut line, id, digits);
     push_hex(&mut line, embedded_can::Frame::dlc(frame) as u32, 1);
@@ -270,9 +266,9 @@ fn hex(digits: &[u8]) -> Option<u32> {
 }
 
 const BEL: u8 = 0x07;
-/// Timestamps count milliseconds of a minute.
+/// Timestamps are milliseconds within a minute.
 const TIMESTAMP_MODULUS: u64 = 60_000;
-/// S0 to S8 (section 3), bit/s.
+/// Bit rates of S0 to S8 (section 3), bit/s.
 const BITRATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Sessions of an slcan client, cut at every byte, and what is wrong with a line.
+//! Sessions of an slcan client, cut at every byte, and invalid lines.
 
 use std::format;
 use std::string::String;
@@ -7,7 +7,7 @@ use std::vec::Vec;
 use super::*;
 use proptest::prelude::*;
 
-/// Everything a channel makes of `bytes` given in chunks of `size`.
+/// The frames and answers of a channel for `bytes`, given in chunks of `size`.
 fn feed(channel: &mut Channel, bytes: &[u8], size: usize) -> (Vec<CanFrame>, Vec<u8>) {
     let (mut frames, mut answers) = (Vec::new(), Vec::new());
     for mut chunk in bytes.chunks(size) {
@@ -160,7 +160,7 @@ proptest! {
         let (mut one, mut other) = (Channel::new(500_000), Channel::new(500_000));
         let whole = feed(&mut one, &bytes, bytes.len().max(1));
         prop_assert_eq!(&feed(&mut other, &bytes, size), &whole);
-        // Whatever was sent came from a line that says exactly this frame.
+        // Every sent frame came from a line that encodes exactly this frame.
         let lines: Vec<_> = bytes.split(|&byte| byte == b'\r').collect();
         prop_assert!(whole.0.len() <= lines.len());
     }

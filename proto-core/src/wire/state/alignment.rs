@@ -1,9 +1,9 @@
-//! Checks whether bytes are a packet: the stream has no mark that shows where a packet begins
-//! (docs/wire/state.md section 3, D8).
+//! Checks whether bytes are a packet: the stream has no mark that shows where a packet begins (docs/wire/state.md
+//! section 3, D8).
 //!
-//! In: the bytes of one packet, and what the previous packets on its connection showed. Out: why
-//! they cannot be a packet. No single item decides: a NaN makes its own item unknown, not the
-//! packet. Reserved items and items that users write are not looked at.
+//! In: the bytes of one packet, and what earlier packets of its connection showed. Out: why they cannot be a packet. No
+//! single item decides: a NaN makes only its own item unknown. Reserved items and items that users write are not
+//! checked.
 
 use core::fmt;
 
@@ -11,7 +11,7 @@ use super::places::{BLOCK, BOOL_BLOCKS, BOOL_BYTES, BOOLS, FARTHEST_RAD, LIMITS,
 use super::view::{LEN, StateView};
 use crate::wire::runs::copy;
 
-/// Why bytes do not begin at the beginning of a packet (docs/wire/state.md section 3, D8).
+/// Why bytes are not an aligned packet (docs/wire/state.md section 3, D8).
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -34,15 +34,15 @@ pub enum Misaligned {
         /// Number allowed.
         allowed: u16,
     },
-    /// The state codes are not a started controller's, and too many quantities are not finite,
-    /// larger than their unit allows, or tiny without being 0.
+    /// The state codes are not those of a started controller, and too many quantities are not finite, too large for
+    /// their unit, or tiny without being 0.
     Quantities {
         /// Number of such quantities.
         wrong: u16,
         /// Number allowed.
         allowed: u16,
     },
-    /// The state codes have changed, and the arm is too far from where it was one packet ago.
+    /// The state codes have changed, and the arm is too far from its position in the previous packet.
     Elsewhere {
         /// The largest distance of a joint (rad) or of a coordinate of the TCP (m).
         distance: f32,
@@ -76,33 +76,31 @@ impl fmt::Display for Misaligned {
 impl core::error::Error for Misaligned {}
 
 impl StateView<'_> {
-    /// Checks whether the bytes can be a packet, as far as one packet can show it (D8). Reserved
-    /// items and items that users write are not looked at. [`StateStream`](super::StateStream) also
-    /// checks how the packet fits the previous one.
+    /// Checks whether the bytes can be a packet, as far as a single packet shows it (D8). Reserved items and items that
+    /// users write are not checked. [`StateStream`](super::StateStream) also compares the packet with the previous one.
     ///
     /// # Errors
-    /// [`Misaligned`] says why they cannot.
+    /// [`Misaligned`], with the reason.
     pub fn check_alignment(&self) -> Result<(), Misaligned> {
         check(self.as_bytes(), is_started(codes(self.as_bytes())))
     }
 }
 
-/// What the previous packets of a connection have shown.
+/// What earlier packets of a connection showed.
 #[derive(Debug, Clone)]
 pub(super) struct Earlier {
     /// The newest state codes of a started controller.
     codes: Option<[u8; 4]>,
-    /// Where the arm was in the previous packet; meaningless without `codes`.
+    /// Joint positions in the previous packet, and the TCP's position; meaningless without `codes`.
     joints: [u8; JOINTS],
     tcp: [u8; TCP],
 }
 
 impl Earlier {
-    /// A connection before its first packet.
+    /// The state before a connection's first packet.
     pub(super) const NONE: Self = Self { codes: None, joints: [0; JOINTS], tcp: [0; TCP] };
 
-    /// Whether the bytes can be the connection's next packet; if so, their codes and position are
-    /// remembered.
+    /// Whether the bytes can be the connection's next packet; if so, remembers their codes and position.
     pub(super) fn check(&mut self, bytes: &[u8; LEN]) -> Result<(), Misaligned> {
         let codes = codes(bytes);
         let is_as_before = self.codes == Some(codes);
@@ -119,13 +117,13 @@ impl Earlier {
         Ok(())
     }
 
-    /// The codes differ from the previous ones, or are the first.
+    /// Checks the position, because the codes differ from the previous ones.
     fn check_change(&self, bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
         if self.codes.is_none() {
             return Ok(());
         }
         let mut distance = farthest(&self.joints, part::<JOINTS>(bytes, 0));
-        // The TCP of a started controller jumps when a program takes another tool.
+        // The TCP of a started controller jumps when a program selects another tool.
         if !is_started {
             distance = distance.max(farthest(&self.tcp, part::<TCP>(bytes, TCP_POSE)));
         }
@@ -151,12 +149,11 @@ fn check(bytes: &[u8; LEN], is_started: bool) -> Result<(), Misaligned> {
     if is_started { Ok(()) } else { check_quantities(bytes) }
 }
 
-/// The closer check. A shifted packet mostly has no codes, or all zeros, in place of a started
-/// controller's.
+/// Checks all quantities. A shifted packet mostly has invalid codes, or all zeros, in place of a started controller's.
 fn check_quantities(bytes: &[u8; LEN]) -> Result<(), Misaligned> {
     let wrong = bytes.as_chunks().0.iter().zip(&LIMITS).map(|(item, &most)| {
         let size = (u32::from_le_bytes(*item) & !SIGN) as i32;
-        // Without a branch, so that the compiler can check several per instruction.
+        // Without a branch, the compiler can check several per instruction.
         u32::from((most != 0) & ((size > most) | (size != 0) & (size < LEAST)))
     });
     let wrong: u32 = wrong.sum();
@@ -171,8 +168,8 @@ fn codes(bytes: &[u8; LEN]) -> [u8; 4] {
     *part(bytes, STATES)
 }
 
-/// Whether a controller that has finished its start shows these codes. One of them may be missing
-/// in the table of section 4: versions differ.
+/// Whether these are the codes of a controller that has finished its start. One of them may be unknown in section 4,
+/// because versions differ.
 fn is_started([mode, robot, program, safety]: [u8; 4]) -> bool {
     let unknown = [mode > 2, robot > 7, program > 5, safety > 15 && safety != 99];
     robot != 0 && safety > 1 && unknown.into_iter().filter(|unknown| *unknown).count() <= 1
@@ -197,7 +194,7 @@ fn first_wrong_joint(joints: &[u8; JOINTS], wrong: u8) -> Misaligned {
     Misaligned::JointPosition { wrong, allowed: ALLOWED_WRONG_JOINTS, joint, position }
 }
 
-/// Whether every bool is 0 or 1: checked many at a time, since nearly every packet is right.
+/// Whether every bool is 0 or 1. Checks many at a time, since nearly every packet passes.
 fn are_bools(bytes: &[u8; LEN]) -> bool {
     let mut words = 0;
     for run in BOOL_BLOCKS {
@@ -213,34 +210,33 @@ fn wrong_bools(bytes: &[u8; LEN]) -> u16 {
     all.map(|&byte| u16::from(byte > 1)).sum()
 }
 
-/// The largest difference of two floats at the same place, not counting floats that are not finite.
+/// The largest difference of two finite floats at the same place.
 fn farthest(before: &[u8], now: &[u8]) -> f32 {
     let items = before.as_chunks().0.iter().zip(now.as_chunks().0);
     let differences = items.map(|(a, b)| (f32::from_le_bytes(*a) - f32::from_le_bytes(*b)).abs());
     differences.filter(|difference| difference.is_finite()).fold(0.0, f32::max)
 }
 
-/// Bytes of six joint positions.
+/// Length of six joint positions in bytes.
 const JOINTS: usize = 24;
-/// Bytes of the TCP's X, Y and Z.
+/// Length of the TCP's X, Y and Z in bytes.
 const TCP: usize = 12;
 
 const SIGN: u32 = 0x8000_0000;
 
-/// Bits of 2^-119, 1.5e-36. Integers and bools that are read as floats are below; squared
-/// rounding errors, 1e-33, are not.
+/// Bits of 2^-119, 1.5e-36. Integers and bools read as floats are smaller; squared rounding errors (1e-33) are larger.
 const LEAST: i32 = 0x0400_0000;
 
-/// Two encoders may be unreadable at a time; a shift is noticed without the joints too.
+/// Two encoders may be unreadable at a time; a shift is also noticed without the joints.
 const ALLOWED_WRONG_JOINTS: u8 = 2;
 
-/// Versions differ in what they put into a few bool bytes (D8).
+/// Versions differ in the contents of a few bool bytes (D8).
 const ALLOWED_WRONG_BOOLS: u16 = 8;
 
-/// A value that cannot be read is a NaN; two are allowed.
+/// A value that cannot be read is NaN; two are allowed.
 const ALLOWED_WRONG_QUANTITIES: u16 = 2;
 
-/// In rad or m. In 100 ms no joint and no TCP moves this far.
+/// In rad or m. No joint and no TCP moves this far in 100 ms.
 const ALLOWED_DISTANCE: f32 = 0.5;
 
 #[cfg(test)]

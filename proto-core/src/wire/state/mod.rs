@@ -1,9 +1,8 @@
 //! The 1468-byte state packet of port 2001 (docs/wire/state.md).
 //!
-//! In: the bytes of one packet, or of a stream of them ([`StateStream`]). Out: a checked view
-//! ([`StateView`]) and a plain value ([`StatePacket`]). Does not know time, connections, the
-//! reaction to a misaligned stream, or system variables; [`crate::sysvar`] takes those from a
-//! packet.
+//! In: the bytes of one packet, or of a stream of them ([`StateStream`]). Out: a checked view ([`StateView`]) and a
+//! plain value ([`StatePacket`]). Does not know time, connections, what to do about a misaligned stream, or system
+//! variables; [`crate::sysvar`] reads those from a packet.
 
 mod alignment;
 mod packet;

@@ -1,4 +1,4 @@
-//! THE table of the packet's fields (docs/wire/state.md section 2), and the plain value.
+//! The table of the packet's fields (docs/wire/state.md section 2), and the plain value.
 
 use super::view::{LEN, StateError, StateView};
 use crate::wire::scalar::ScalarType;
@@ -30,7 +30,7 @@ pub struct FieldPlace {
     pub ty: ScalarType,
     /// Number of items.
     pub count: u16,
-    /// Their kind.
+    /// Kind of the items.
     pub content: Content,
 }
 
@@ -41,7 +41,7 @@ impl FieldPlace {
     }
 }
 
-/// An item's type: its scalar type and its bytes, little-endian (D1).
+/// An item's type: its scalar type and its little-endian bytes (D1).
 trait StateItem: Copy {
     const TYPE: ScalarType;
     const ZERO: Self;
@@ -112,7 +112,7 @@ impl<T: StateItem, const N: usize> StateField for [T; N] {
     }
 }
 
-/// From the rows: the table, the value with its decoding and encoding, and the view's accessors.
+/// Generates the table, the value with its decoding and encoding, and the view's accessors from the rows.
 macro_rules! packet {
     ($($(#[$doc:meta])* $offset:literal: $name:ident: $ty:ty = $content:expr;)*) => {
         /// Every field of the packet, in order.
@@ -126,11 +126,11 @@ macro_rules! packet {
             },)*
         ];
 
-        /// One packet as a plain value, reserved items included, so that every packet survives
-        /// decoding and encoding unchanged.
+        /// One packet as a plain value. It includes reserved items, so decoding and encoding keep every packet
+        /// unchanged.
         ///
-        /// Bools are bytes, 0 or 1. The codes of the four state machines stand as numbers; see
-        /// [`StateView::states`] and [`Dialect`](crate::wire::dialect::Dialect).
+        /// Bools are bytes, 0 or 1. The codes of the four state machines are numbers; see [`StateView::states`] and
+        /// [`Dialect`](crate::wire::dialect::Dialect).
         #[derive(Debug, Clone, Copy, PartialEq)]
         pub struct StatePacket {
             $($(#[$doc])* pub $name: $ty,)*
@@ -215,8 +215,7 @@ packet! {
     608: tool_frame: [f32; 6] = Values;
     /// Active work-object frame without the tool's offset, m and rad.
     632: work_object_frame: [f32; 6] = Values;
-    /// Reserved; later controller versions have the global speed here (see
-    /// [`StateView::global_speed`]).
+    /// Reserved; the global speed in later controller versions (see [`StateView::global_speed`]).
     656: reserved_656: [u8; 64] = Reserved;
     /// Functional digital inputs 1..8.
     720: functional_inputs: [u8; 8] = Bools { real: 8 };
@@ -270,7 +269,7 @@ packet! {
     1451: safety_state: u8 = Values;
     /// 1: a collision was detected.
     1452: collision: u8 = Values;
-    /// Where: 1..=6 joint; 11..=16 base sensor X, Y, Z, Rx, Ry, Rz; 20 end sensor.
+    /// Where the collision was: 1..=6 joint; 11..=16 base sensor X, Y, Z, Rx, Ry, Rz; 20 end sensor.
     1453: collision_axis: u8 = Values;
     /// Reserved.
     1454: reserved_1454: [u8; 2] = Reserved;
@@ -288,8 +287,7 @@ impl StateView<'_> {
         packet
     }
 
-    /// Decodes every field into an existing packet: same as [`Self::to_packet`], without a second
-    /// packet on the stack.
+    /// Like [`Self::to_packet`], but decodes into an existing packet, to avoid a second packet on the stack.
     pub fn read_into(&self, packet: &mut StatePacket) {
         packet.fill(self.as_bytes());
     }
@@ -299,7 +297,7 @@ impl StatePacket {
     /// Decodes one packet.
     ///
     /// # Errors
-    /// [`StateError`] if `bytes` is not as long as a packet. Its content is not judged; see
+    /// [`StateError`] if `bytes` does not have the length of a packet. The content is not checked; see
     /// [`StateView::check_alignment`].
     pub fn parse(bytes: &[u8]) -> Result<Self, StateError> {
         Ok(StateView::new(bytes)?.to_packet())

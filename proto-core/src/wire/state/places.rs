@@ -1,4 +1,4 @@
-//! What the packet's tables say about places, computed at compile time.
+//! Offsets and limits derived from the packet's tables at compile time.
 #![allow(
     clippy::indexing_slicing,
     clippy::arithmetic_side_effects,
@@ -18,7 +18,7 @@ pub(super) struct Bools {
 /// Every bool that is not reserved, consecutive ones merged.
 pub(super) const BOOLS: &[Bools] = BOOL_RUNS.0.split_at(BOOL_RUNS.1).0;
 
-/// The same in whole blocks.
+/// The parts of [`BOOLS`] that consist of whole blocks.
 pub(super) const BOOL_BLOCKS: &[Bools] = {
     const BLOCKS: ([Bools; BOOLS.len()], usize) = {
         let mut blocks = [Bools { from: 0, len: 0 }; BOOLS.len()];
@@ -38,7 +38,7 @@ pub(super) const BOOL_BLOCKS: &[Bools] = {
 /// Bytes of a block.
 pub(super) const BLOCK: usize = 16;
 
-/// The bools that are in no block.
+/// Offsets of the bools outside the blocks.
 pub(super) const BOOL_BYTES: [usize; single_bools()] = {
     let mut places = [0; single_bools()];
     let (mut run, mut count) = (0, 0);
@@ -63,9 +63,8 @@ const fn single_bools() -> usize {
     count
 }
 
-/// Fields that are looked at more closely in a packet without a started controller's codes, how
-/// many of their items, and how large these can be in their unit. Not here: what is reserved, and
-/// registers and forces, which users write.
+/// Fields that are checked more closely if the codes are not a started controller's: number of checked items, and their
+/// maximum absolute value in their unit. Reserved fields are not listed, nor registers and forces, which users write.
 #[rustfmt::skip]
 pub(super) const QUANTITIES: &[(&str, usize, f32)] = &[
     ("joint_position", 6, FARTHEST_RAD),
@@ -88,8 +87,8 @@ pub(super) const QUANTITIES: &[(&str, usize, f32)] = &[
     ("analog_inputs", 8, 100.0),
 ];
 
-/// The same for each four bytes from the packet's front to the last of them: the bits of the
-/// largest float that can stand there, 0 where nothing is looked at.
+/// The limits for each four bytes from the packet's front to the last quantity: the bits of the largest allowed float,
+/// or 0 if not checked.
 pub(super) static LIMITS: [i32; 200] = {
     let mut limits = [0; 200];
     let mut nth = 0;
@@ -107,15 +106,15 @@ pub(super) static LIMITS: [i32; 200] = {
     limits
 };
 
-/// No joint turns this far.
+/// No joint turns farther.
 pub(super) const FARTHEST_RAD: f32 = 1000.0;
 
-/// Where the TCP's actual pose stands.
+/// Offset of the TCP's actual pose.
 pub(super) const TCP_POSE: usize = row("tcp_pose").offset as usize;
-/// Where the four state codes stand.
+/// Offset of the four state codes.
 pub(super) const STATES: usize = row("operation_mode").offset as usize;
 
-/// A field that is not in the table does not build.
+/// The build fails if the table does not have this field.
 const fn row(name: &str) -> &'static FieldPlace {
     let mut row = 0;
     while !is_same(FIELDS[row].name.as_bytes(), name.as_bytes()) {
@@ -150,7 +149,7 @@ const BOOL_RUNS: ([Bools; FIELDS.len()], usize) = {
     (runs, count)
 };
 
-/// A table with a gap or an overlap, or of another length than a packet, does not build.
+/// The build fails if the table has a gap or an overlap, or not the length of a packet.
 const _: () = {
     let (mut row, mut end) = (0, 0);
     while row < FIELDS.len() {

@@ -1,9 +1,8 @@
-//! Packets out of a connection's bytes (docs/wire/state.md section 3, D8).
+//! Splits a connection's bytes into packets (docs/wire/state.md section 3, D8).
 //!
-//! In: bytes in pieces of any size, from the connection's first byte on. Out: packets, each checked
-//! for alignment by itself and against the previous ones. Does not search for the beginning of a
-//! packet: the stream has no mark. The owner of the connection reopens it when
-//! [`StateStream::is_lost`].
+//! In: bytes in chunks of any size, from the connection's first byte on. Out: packets, each checked for alignment,
+//! alone and against earlier ones. Does not search for the beginning of a packet, because the stream has no mark. The
+//! owner of the connection reopens it if [`StateStream::is_lost`].
 
 use super::alignment::{Earlier, Misaligned};
 use super::view::{LEN, StateView};
@@ -16,7 +15,7 @@ pub const MAX_MISALIGNED: u32 = 3;
 #[derive(Debug, Clone)]
 pub struct StateStream {
     buffer: [u8; LEN],
-    /// Bytes of an incomplete packet in the buffer; [`LEN`] after it was completed and returned.
+    /// Number of held bytes of an incomplete packet; [`LEN`] after a packet was completed and returned.
     len: usize,
     packets: u32,
     misaligned: u32,
@@ -25,15 +24,15 @@ pub struct StateStream {
 }
 
 impl StateStream {
-    /// A stream at the beginning of a connection.
+    /// A stream before its first byte.
     pub const fn new() -> Self {
         Self { buffer: [0; LEN], len: 0, packets: 0, misaligned: 0, in_a_row: 0, earlier: Earlier::NONE }
     }
 
-    /// Takes bytes from the front of `chunk` until a packet is complete. `None` means that all of
-    /// them were taken and no packet is complete.
+    /// Takes bytes from the front of `chunk` until a packet is complete. `None` if all of `chunk` is taken and no
+    /// packet is complete.
     ///
-    /// A packet that lies whole in `chunk` is not copied.
+    /// A packet that is complete in `chunk` is not copied.
     pub fn next_packet<'s, 'c: 's>(
         &'s mut self,
         chunk: &mut &'c [u8],
@@ -73,7 +72,8 @@ impl StateStream {
         }
     }
 
-    /// Takes bytes that do not complete a packet. `false` if they do, or if there are none; then none were taken.
+    /// Takes bytes that do not complete a packet. Returns `false`, with nothing taken, if they do, or if there are
+    /// none.
     pub(crate) fn hold(&mut self, chunk: &[u8]) -> bool {
         let held = self.pending();
         let end = held.saturating_add(chunk.len());
@@ -96,23 +96,22 @@ impl StateStream {
         self.in_a_row >= MAX_MISALIGNED
     }
 
-    /// Good packets so far, over all connections, wrapping.
+    /// Number of good packets, over all connections, wrapping.
     pub const fn packets(&self) -> u32 {
         self.packets
     }
 
-    /// Misaligned packets so far, over all connections, wrapping.
+    /// Number of misaligned packets, over all connections, wrapping.
     pub const fn misaligned(&self) -> u32 {
         self.misaligned
     }
 
-    /// Bytes of an incomplete packet.
+    /// Number of held bytes of an incomplete packet.
     pub const fn pending(&self) -> usize {
         if self.len < LEN { self.len } else { 0 }
     }
 
-    /// Forgets an incomplete packet and what packets have shown, for a new connection; the counters
-    /// stay.
+    /// Drops an incomplete packet and what earlier packets showed, for a new connection; the counters stay.
     pub const fn reset(&mut self) {
         self.len = 0;
         self.in_a_row = 0;

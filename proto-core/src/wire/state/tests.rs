@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use super::{Content, FIELDS, LEN, MAX_MISALIGNED, StateError, StatePacket, StateStream, StateView};
 use crate::wire::dialect::Dialect;
 
-/// A packet told apart from others by its error code.
+/// A packet identified by its error code.
 fn numbered(number: u32) -> [u8; LEN] {
     StatePacket { error_code: number, joint_position: [0.5; 7], ..StatePacket::ZERO }.to_bytes()
 }

@@ -19,7 +19,7 @@ pub struct StateView<'a> {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum StateError {
-    /// There are too few or too many.
+    /// Too few or too many bytes.
     WrongLength {
         /// Length of a packet.
         expected: usize,
@@ -44,7 +44,7 @@ impl<'a> StateView<'a> {
     /// A view of exactly one packet.
     ///
     /// # Errors
-    /// [`StateError`] when `bytes` are more or fewer.
+    /// [`StateError`] if `bytes` has another length.
     pub fn new(bytes: &'a [u8]) -> Result<Self, StateError> {
         match bytes.try_into() {
             Ok(bytes) => Ok(Self { bytes }),

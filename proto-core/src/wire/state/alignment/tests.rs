@@ -58,7 +58,7 @@ fn eight_bools_may_be_something_else() {
 
 #[test]
 fn only_a_started_controllers_codes_spare_the_closer_look() {
-    // Three quantities that no robot has.
+    // Three quantities that no robot can have.
     let strange = StatePacket { tcp_velocity: [f32::NAN, 1e9, 1e-40, 0.0, 0.0, 0.0], ..StatePacket::ZERO };
     let wrong = Err(Misaligned::Quantities { wrong: 3, allowed: 2 });
     for (codes, expected) in [
@@ -107,7 +107,7 @@ fn the_closer_look_sees_every_quantity_and_nothing_else() {
                 (f32::NAN, false),
             ] {
                 for value in [value, -value] {
-                    // Two others are wrong already.
+                    // Two others are already wrong.
                     let mut bytes = StatePacket::ZERO.to_bytes();
                     let place = usize::from(field.offset) + item * size;
                     let others = if field.name == "tcp_pose" { [464, 468] } else { [368, 372] };
@@ -138,18 +138,18 @@ fn a_place_that_changes_with_the_codes_is_another_packets() {
     };
     let on = [2, 6, 0, 5];
     for (next, good) in [
-        // Teleported, the codes the same: lost packets, say.
+        // The position jumps, but the codes stay: packets were lost, for example.
         (at(2.0, 1.0, on), true),
-        // The robot was switched off where it was.
+        // The robot was switched off without moving.
         (at(0.3, 0.3, [2, 4, 0, 5]), true),
         (at(0.8, 0.8, [0; 4]), true),
         (at(0.801, 0.3, [0; 4]), false),
         (at(0.3, 0.801, [0; 4]), false),
         (at(-0.201, 0.3, [255; 4]), false),
         (at(-0.201, 0.3, [2, 4, 0, 5]), false),
-        // A program began with another tool.
+        // A program started with another tool.
         (at(0.3, -0.201, [2, 6, 2, 5]), true),
-        // What was not read has no place.
+        // An unreadable position is not compared.
         (at(f32::NAN, 0.3, [0; 4]), false),
         (at(0.3, f32::NAN, [0; 4]), true),
         (at(0.3, f32::NEG_INFINITY, [0; 4]), true),
@@ -158,7 +158,7 @@ fn a_place_that_changes_with_the_codes_is_another_packets() {
         assert!(stream.next_packet(&mut &at(0.3, 0.3, on)[..]).unwrap().is_ok());
         assert_eq!(stream.next_packet(&mut &next[..]).unwrap().is_ok(), good);
     }
-    // It comes again and again; then the connection is new.
+    // Rejected each time, until the connection is reset.
     let mut stream = StateStream::new();
     assert!(stream.next_packet(&mut &at(0.3, 0.3, on)[..]).unwrap().is_ok());
     for nth in 1..=MAX_MISALIGNED {
@@ -168,10 +168,10 @@ fn a_place_that_changes_with_the_codes_is_another_packets() {
     }
     stream.reset();
     assert!(stream.next_packet(&mut &at(1.8, 0.3, [0; 4])[..]).unwrap().is_ok());
-    // A controller that never showed a started one's codes may change them as it likes.
+    // Before a started controller's codes were seen, any change is accepted.
     assert!(stream.next_packet(&mut &at(-1.8, 0.3, [0, 1, 0, 0])[..]).unwrap().is_ok());
     assert!(stream.next_packet(&mut &at(1.8, 0.3, on)[..]).unwrap().is_ok());
-    // In the manner of a mode that this table does not have: the robot goes far, bit by bit.
+    // Codes of a mode that the table does not have: the robot moves far, in small steps.
     for nth in 0..100 {
         let next = at(1.8 - 0.4 * nth as f32, 0.3, [9, 9, 9, 9]);
         assert!(stream.next_packet(&mut &next[..]).unwrap().is_ok(), "{nth}");
@@ -221,8 +221,8 @@ fn the_page_has_the_same_limits() {
     assert_eq!(written, expected);
 }
 
-/// One loss for each number of bytes: how often a wrong alignment passes by itself, and for good
-/// in a stream that was right before.
+/// Shifts `packet` by each number of bytes. Counts how often the shifted packet passes on its own, and how often it
+/// passes for good in a stream that was aligned before.
 #[track_caller]
 fn unseen(packet: &[u8; LEN]) -> (usize, usize) {
     let (mut by_itself, mut for_good) = (0, 0);
@@ -242,7 +242,7 @@ fn unseen(packet: &[u8; LEN]) -> (usize, usize) {
 
 #[test]
 fn a_resting_robots_stream_is_not_taken_for_another() {
-    // Encoders, currents and sensors that tremble, and a controller that computes them all.
+    // Noisy encoders, currents and sensors, and a controller that computes all quantities.
     let mut noisy = STARTED;
     noisy.joint_position = [0.30012, -1.20047, 1.90003, 0.69991, 1.50078, -0.10021, 0.0];
     noisy.target_joint_position = [0.3, -1.2, 1.9, 0.7, 1.5, -0.1, 0.0];
@@ -257,7 +257,7 @@ fn a_resting_robots_stream_is_not_taken_for_another() {
     noisy.flange_force = [0.7, -1.2, 0.4, 0.03, -0.01, 0.02];
     noisy.tool_frame = [0.0, 0.0, 0.12, 0.0, 0.0, 0.0];
     noisy.analog_inputs = [4.01, 0.003, 0.002, 0.004, 0.011, 0.012, 0.009, 0.01];
-    // Nothing trembles: another simulator.
+    // Without noise, as from another simulator.
     let mut still = noisy;
     still.joint_position = still.target_joint_position;
     still.joint_velocity = [0.0; 7];
@@ -276,6 +276,6 @@ fn a_resting_robots_stream_is_not_taken_for_another() {
         assert!(by_itself <= most, "{by_itself}");
         assert_eq!(for_good, 0);
     }
-    // A packet that is all zeros but for its codes cannot be told from itself shifted.
+    // A packet of zeros except for its codes cannot be told from a shifted one.
     assert!(unseen(&STARTED.to_bytes()).1 > 1400);
 }
