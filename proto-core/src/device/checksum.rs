@@ -1,14 +1,14 @@
 //! Checksums of field devices' frames: CRCs with any parameters, sums, and exclusive or.
 //!
-//! In: an algorithm, and the bytes it covers, in pieces. Out: the checksum as a number, or as the
-//! bytes of a frame. Does not know which bytes of a frame are covered.
+//! In: an algorithm, and the bytes to check, in pieces. Out: the checksum as a number, or as the bytes of a frame. Does
+//! not know which bytes of a frame are covered.
 //!
-//! A CRC needs no table in memory: it works on half bytes with 16 values that are made for each
-//! long run of bytes, and bit by bit over a short one.
+//! CRC tables are not kept in memory: for long runs, 16 values for half bytes are computed each time; short runs are
+//! computed bit by bit.
 
 use super::order::ByteOrder;
 
-/// The parameters of a CRC, as catalogues of CRCs give them.
+/// The parameters of a CRC, as in catalogues of CRCs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -17,9 +17,9 @@ pub struct Crc {
     pub width: u8,
     /// The polynomial without its highest term, highest power first.
     pub poly: u32,
-    /// The register's value before the first byte, as if nothing were reflected.
+    /// The register before the first byte, not reflected.
     pub init: u32,
-    /// What the result is combined with by exclusive or.
+    /// XORed with the result.
     pub xorout: u32,
     /// Bytes are taken lowest bit first.
     pub refin: bool,
@@ -41,8 +41,7 @@ pub enum Algorithm {
     Sum16,
     /// Exclusive or of all bytes.
     Xor8,
-    /// What makes the sum of all bytes zero: the two's complement of [`Algorithm::Sum8`], as in
-    /// Modbus ASCII.
+    /// The value that makes the sum of all bytes zero: the two's complement of [`Algorithm::Sum8`], as in Modbus ASCII.
     Lrc,
 }
 
@@ -50,7 +49,7 @@ const fn crc(width: u8, poly: u32, init: u32, reflected: bool, xorout: u32) -> A
     Algorithm::Crc(Crc { width, poly, init, xorout, refin: reflected, refout: reflected })
 }
 
-/// The algorithms with a name, and the names as configuration files use them.
+/// The named algorithms, with their names in configuration files.
 const NAMED: [(&str, Algorithm); 24] = [
     ("crc8", crc(8, 0x07, 0, false, 0)),
     ("crc8-autosar", crc(8, 0x2F, 0xFF, false, 0xFF)),
@@ -78,29 +77,28 @@ const NAMED: [(&str, Algorithm); 24] = [
     ("lrc", Algorithm::Lrc),
 ];
 
-/// A run of at least this many bytes pays for its table of half bytes.
+/// From this many bytes on, building the table of half bytes pays off.
 const LONG_RUN: usize = 16;
 
 impl Crc {
-    /// Whether the parameters describe a CRC: 1 to 32 bits, and no number with more bits than that.
+    /// Whether the parameters describe a CRC: a width of 1 to 32 bits, and no parameter exceeds it.
     pub const fn is_valid(&self) -> bool {
         let numbers = self.poly | self.init | self.xorout;
         matches!(self.width, 1..=32) && numbers.unbounded_shr(self.width as u32) == 0
     }
 
-    /// Bits of the register that a CRC of this width leaves unused at one end.
+    /// Unused bits at one end of the register.
     const fn unused(&self) -> u32 {
         32_u32.saturating_sub(self.width as u32)
     }
 
-    /// The lowest `width` bits of `number` at the front of the register: on top, or reflected at the
-    /// bottom.
+    /// Aligns `number` with the front of the register: the top, or the bottom with its bits reflected.
     const fn at_front(&self, number: u32) -> u32 {
         let on_top = number.unbounded_shl(self.unused());
         if self.refin { on_top.reverse_bits() } else { on_top }
     }
 
-    /// The register after `steps` bits of zeros.
+    /// The register after `steps` zero bits.
     fn shifted(&self, register: u32, steps: u32) -> u32 {
         let poly = self.at_front(self.poly);
         (0..steps).fold(register, |register, _| {
@@ -156,17 +154,17 @@ impl Algorithm {
         NAMED.iter().find(|(known, _)| *known == name).map(|&(_, algorithm)| algorithm)
     }
 
-    /// The names, for messages.
+    /// The names of all named algorithms, for messages.
     pub fn names() -> impl ExactSizeIterator<Item = &'static str> {
         NAMED.iter().map(|&(name, _)| name)
     }
 
-    /// The name of this algorithm, unless it is a CRC with other parameters than the named ones.
+    /// The algorithm's name; `None` for a CRC with other parameters than the named ones.
     pub fn name(&self) -> Option<&'static str> {
         NAMED.iter().find(|(_, known)| known == self).map(|&(name, _)| name)
     }
 
-    /// Number of bytes that the checksum has in a frame, 1..=4.
+    /// Length of the checksum in a frame, 1..=4 bytes.
     pub const fn len(&self) -> usize {
         match self {
             Self::Crc(crc) => (crc.width as usize).div_ceil(8),
@@ -175,13 +173,12 @@ impl Algorithm {
         }
     }
 
-    /// Whether the checksum has no bytes: never, for parameters that are valid.
+    /// Whether the length is 0: never, if the parameters are valid.
     pub const fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The byte order that the standard has: a reflected CRC is sent low byte first, any other
-    /// checksum high byte first.
+    /// The usual byte order: low byte first for a reflected CRC, otherwise high byte first.
     pub const fn order(&self) -> ByteOrder {
         match self {
             Self::Crc(Crc { refout: true, .. }) => ByteOrder::Little,
@@ -189,7 +186,7 @@ impl Algorithm {
         }
     }
 
-    /// The checksum of these bytes, which follow each other in pieces.
+    /// The checksum of these consecutive pieces.
     pub fn of<'a>(&self, pieces: impl IntoIterator<Item = &'a [u8]>) -> u32 {
         let pieces = pieces.into_iter();
         let sum =
@@ -216,7 +213,7 @@ mod tests {
 
     use super::*;
 
-    /// What "123456789" gives, in the catalogue of CRCs.
+    /// The checksums of "123456789", from the catalogue of CRCs.
     #[test]
     fn named_algorithms_give_the_catalogues_check_values() {
         let checks = [
@@ -240,7 +237,7 @@ mod tests {
             ("crc32", oracle::CRC_32_ISO_HDLC.check),
             ("crc32-mpeg-2", oracle::CRC_32_MPEG_2.check),
             ("crc32c", oracle::CRC_32_ISCSI.check),
-            // By hand: 0x31 + 0x32 + ... + 0x39 is 0x1DD; all nine by exclusive or are 0x31.
+            // By hand: 0x31 + 0x32 + ... + 0x39 is 0x1DD; the exclusive or of all nine is 0x31.
             ("sum8", 0xDD),
             ("sum16", 0x01DD),
             ("xor8", 0x31),
@@ -277,7 +274,7 @@ mod tests {
         assert!(!Crc { width: 33, ..valid }.is_valid());
     }
 
-    /// A CRC as its definition says, a bit at a time in a wide register.
+    /// A CRC by its definition, one bit at a time in a wide register.
     fn slow(crc: &Crc, bytes: &[u8]) -> u32 {
         let (width, top) = (u32::from(crc.width), 1_u64 << crc.width);
         let mut register = u64::from(crc.init);

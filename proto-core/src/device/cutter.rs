@@ -1,40 +1,38 @@
-//! Cuts a stream of bytes into frames whose ends do not depend on their fields: a tail, escape
-//! bytes, or silence.
+//! Splits a byte stream into frames whose ends do not depend on their fields: by a tail, escape bytes, or silence.
 //!
-//! In: chunks of any size, and the news that the line was silent. Out: whole frames, without
-//! escapes, still to be compared with a layout ([`FrameLayout::probe_whole`]), and what is broken.
-//! A broken frame ends where the next end is, so that its last bytes are never taken for a frame.
-//! Each received byte takes the same few steps.
+//! In: chunks of any size, and notice that the line was silent. Out: frames without escapes, still to be matched with a
+//! layout ([`FrameLayout::probe_whole`]), and broken frames. A broken frame lasts until the next end, so its last bytes
+//! are never taken for a frame. The work per received byte is constant.
 //!
 //! [`FrameLayout::probe_whole`]: super::FrameLayout::probe_whole
 
 use super::escape::{DLE, END, ESC, ESC_END, ESC_ESC, ETX, Escape, STX};
 use crate::recipe::model::MAX_STREAM_FRAME;
 
-/// What tells the frames of a stream apart.
+/// How the frames of a stream are separated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Boundary {
-    /// Their fields, head and tail: a frame is searched at each byte.
+    /// By their fields, head and tail: a frame is searched at each byte.
     #[default]
     Fields,
-    /// The tail alone: a frame is what came behind the tail before, up to its own.
+    /// By the tail alone: a frame begins after the previous tail.
     Tail,
-    /// A frame is what came between two silences of the line.
+    /// By silence before and after a frame.
     Silence,
 }
 
-/// What came between two ends.
+/// The bytes between two ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Piece<'a> {
-    /// Whole, without escapes.
+    /// A frame, without escapes.
     Whole(&'a [u8]),
-    /// Longer than any frame; its first bytes.
+    /// Longer than the longest frame; only its first bytes.
     TooLong(&'a [u8]),
-    /// With escape bytes that mean nothing; the bytes before them.
+    /// An invalid escape sequence; only the bytes before it.
     BadEscape(&'a [u8]),
-    /// The last bytes of what silence has cut.
+    /// The rest of a frame after a discard.
     Cut(&'a [u8]),
 }
 
@@ -52,31 +50,31 @@ enum Ends {
     Escape(Escape),
 }
 
-/// Cuts a stream of bytes into frames.
+/// Splits a byte stream into frames.
 #[derive(Debug, Clone)]
 pub struct Cutter {
     ends: Ends,
     buffer: [u8; MAX_STREAM_FRAME],
     len: u16,
-    /// What is held has been returned.
+    /// The held bytes have been returned.
     is_done: bool,
     fault: Option<Fault>,
-    /// The newest eight bytes since the last end, and how many there are.
+    /// The newest eight bytes since the last end, and how many are valid.
     newest: u64,
     newest_len: u8,
-    /// An escape byte came, and what it escapes did not.
+    /// The last byte was an escape byte.
     is_escaped: bool,
-    /// DLE STX came: a frame has begun, or the next one has, while this one had no end.
+    /// DLE STX was received: a frame has begun. `is_reopened`: so has the next one, before this one ended.
     is_open: bool,
     is_reopened: bool,
-    /// COBS: bytes that are left of the group, and whether a zero follows it.
+    /// COBS: bytes left in the group, and whether a zero follows the group.
     group: u8,
     zero_due: bool,
     skipped_bytes: u32,
 }
 
 impl Cutter {
-    /// For frames that end like this; `None` if their fields tell.
+    /// A cutter for these ends of frames; `None` if the fields determine them.
     pub const fn new(boundary: Boundary, escape: Option<Escape>) -> Option<Self> {
         let ends = match (boundary, escape) {
             (_, Some(escape)) => Ends::Escape(escape),
@@ -106,8 +104,8 @@ impl Cutter {
         self.ends == Ends::Silence
     }
 
-    /// What came up to the next end. Takes bytes from the front of `chunk`, all of them if it
-    /// returns `None`. `tail` is always the same.
+    /// The bytes up to the next end. Takes bytes from the front of `chunk`; returns `None` once all are taken. `tail`
+    /// must always be the same.
     pub fn next_piece(&mut self, chunk: &mut &[u8], tail: &[u8]) -> Option<Piece<'_>> {
         while let Some((&byte, rest)) = chunk.split_first() {
             *chunk = rest;
@@ -133,25 +131,25 @@ impl Cutter {
         None
     }
 
-    /// The line was silent: the frame that this ends, if silence ends frames.
+    /// Call this when the line was silent. Returns the frame that has ended, if silence ends frames.
     pub fn silence(&mut self) -> Option<Piece<'_>> {
         if self.ends == Ends::Silence && self.has_begun() { Some(self.piece()) } else { None }
     }
 
-    /// Whether silence has something to end.
+    /// Whether bytes of an unfinished frame are held.
     pub fn has_begun(&self) -> bool {
         let is_cut = self.ends == Ends::Silence && self.fault.is_some();
         let in_escapes = self.is_escaped || self.is_open || self.group > 0 || self.zero_due;
         !self.is_done && (self.len > 0 || is_cut || in_escapes) || self.is_done && self.is_reopened
     }
 
-    /// The bytes of the frame that has begun.
+    /// The held bytes of an unfinished frame.
     pub fn held(&self) -> &[u8] {
         if self.is_done { &[] } else { self.buffer.get(..usize::from(self.len)).unwrap_or(&[]) }
     }
 
-    /// Drops a frame that has begun, because the line was silent or bytes are missing, and returns
-    /// the number of bytes. What comes up to the next end is dropped with it.
+    /// Drops an unfinished frame, because the line was silent or bytes are missing, and returns its number of bytes.
+    /// The bytes up to the next end are dropped too.
     pub fn discard(&mut self) -> usize {
         let dropped = self.held().len();
         let was_cut = self.has_begun() || !self.is_done && self.fault.is_some();
@@ -159,13 +157,13 @@ impl Cutter {
         self.begin();
         if was_cut && self.ends != Ends::Escape(Escape::Dle) {
             self.fault = Some(Fault::Cut);
-            // The tail itself may have been cut.
+            // Kept, because the discard may have split the tail.
             (self.newest, self.newest_len) = newest;
         }
         dropped
     }
 
-    /// Bytes outside frames so far, wrapping.
+    /// Number of bytes outside frames so far, wrapping.
     pub const fn skipped_bytes(&self) -> u32 {
         self.skipped_bytes
     }
@@ -216,7 +214,7 @@ impl Cutter {
         let was_escaped = core::mem::take(&mut self.is_escaped);
         match byte {
             END if self.len == 0 && !was_escaped => {
-                // Also the first byte of a frame, and the end of what was cut before it.
+                // This END may begin a frame, or end a frame that was cut before.
                 self.begin();
                 return false;
             }
@@ -246,7 +244,7 @@ impl Cutter {
                 return false;
             }
             self.is_escaped = byte == DLE;
-            // A DLE is counted when the byte behind it is known.
+            // A DLE is counted once the next byte is known.
             let skipped = u32::from(was_escaped).saturating_add(u32::from(byte != DLE));
             self.skipped_bytes = self.skipped_bytes.wrapping_add(skipped);
             return false;
@@ -256,7 +254,7 @@ impl Cutter {
             (false, _) | (true, DLE) => self.push(byte),
             (true, ETX) => return true,
             (true, _) => {
-                // Another beginning, or an escape that does not exist: nobody knows what was lost.
+                // Another beginning, or an invalid escape: it is unknown what was lost.
                 self.broken();
                 self.is_reopened = byte == STX;
                 return true;

@@ -1,7 +1,7 @@
-//! How one field of a device's frame is written: numbers in any byte order, bits, BCD, digits.
+//! Encoding of one field of a device's frame: numbers in any byte order, bits, BCD, digits.
 //!
-//! In: the field's bytes, or a number. Out: the other. Does not know where in a frame the field is,
-//! nor what its value is for.
+//! In: the field's bytes, or a number. Out: the other. Does not know the field's position in the frame or the meaning
+//! of its value.
 
 use core::fmt;
 use core::ops::RangeInclusive;
@@ -10,30 +10,30 @@ use super::order::ByteOrder;
 use crate::image::round;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// Maximum number of characters of a number in digits, sign and point included.
+/// Maximum number of characters of a decimal number, sign and point included.
 pub const MAX_DIGITS: usize = 16;
 
-/// How a field is written.
+/// How a field is encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Encoding {
-    /// What the bytes mean.
+    /// How the bytes are interpreted.
     pub kind: Kind,
-    /// Their order. Digits are read from left to right, whatever it is.
+    /// Byte order. Ignored for digits, which are read from left to right.
     pub order: ByteOrder,
-    /// The field begins where the one before it began: other bits of the same number, or a second
-    /// use of the same bytes.
+    /// The field begins where the previous one began: for other bits of the same number, or a second use of the same
+    /// bytes.
     pub shared: bool,
 }
 
-/// What the bytes of a field mean.
+/// How the bytes of a field are interpreted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[non_exhaustive]
 pub enum Kind {
-    /// One of the recipes' own types.
+    /// A scalar type, as in recipes.
     Scalar(ScalarType),
     /// Unsigned, three bytes.
     Uint24,
@@ -46,7 +46,7 @@ pub enum Kind {
     },
     /// Decimal digits in ASCII, with a sign if negative.
     Decimal(Digits),
-    /// Hexadecimal digits in ASCII, at most eight; written in capitals.
+    /// Hexadecimal digits in ASCII, at most eight; written in upper case.
     Hex(Width),
     /// Some bits of an unsigned number.
     Bits(Bits),
@@ -59,8 +59,7 @@ pub enum Kind {
 pub struct Digits {
     /// Number of characters.
     pub width: Width,
-    /// Number of digits that are written behind a point; 0 writes no point. What is read may have a
-    /// point or not.
+    /// Number of digits written after the point; 0 writes no point. Received numbers may have a point or not.
     pub decimals: u8,
 }
 
@@ -69,9 +68,9 @@ pub struct Digits {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Width {
-    /// Always so many, 1..=16; written with leading zeros.
+    /// Exactly this many, 1..=16; written with leading zeros.
     Fixed(u8),
-    /// As many as there are before this byte, which follows the field; at most 16.
+    /// All before this byte, which follows the field; at most 16.
     Until(u8),
 }
 
@@ -80,17 +79,17 @@ pub enum Width {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Bits {
-    /// Bytes of the number, 1..=8.
+    /// Length of the number in bytes, 1..=8.
     pub bytes: u8,
-    /// The lowest of the bits.
+    /// The lowest bit.
     pub first: u8,
     /// Number of bits, 1..=32.
     pub count: u8,
-    /// The highest of them is a sign.
+    /// The highest bit is a sign.
     pub signed: bool,
 }
 
-/// Why the bytes of a field are not a value.
+/// Why the bytes of a field cannot be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -99,7 +98,7 @@ pub enum Unreadable {
     Length,
     /// A character or half byte that is not a digit.
     NotADigit,
-    /// More digits than the number can have.
+    /// The number is too large for its kind.
     TooLarge,
 }
 
@@ -115,15 +114,15 @@ impl fmt::Display for Unreadable {
 
 impl core::error::Error for Unreadable {}
 
-/// What becomes of a number that a field or a variable cannot hold.
+/// What happens to a number that is out of a field's or variable's range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Overflow {
-    /// A received frame with it is rejected; a sent one has the nearest number.
+    /// A received frame with such a number is rejected; a sent frame gets the nearest number in range.
     #[default]
     Usual,
-    /// It wraps around, as a counter does. Integers only.
+    /// It wraps around, like a counter. Integers only.
     Wrap,
 }
 
@@ -132,7 +131,7 @@ impl Encoding {
         Self { kind, order: ByteOrder::Little, shared: false }
     }
 
-    /// A value of this type, lowest byte first: as recipes have it.
+    /// A value of this type, lowest byte first, as in recipes.
     pub const fn scalar(ty: ScalarType) -> Self {
         Self::of(Kind::Scalar(ty))
     }
@@ -152,22 +151,22 @@ impl Encoding {
         Self::of(Kind::Bcd { bytes })
     }
 
-    /// A decimal number of so many characters in ASCII, 1..=16.
+    /// A decimal number of this many ASCII characters, 1..=16.
     pub const fn decimal(width: u8) -> Self {
         Self::of(Kind::Decimal(Digits { width: Width::Fixed(width), decimals: 0 }))
     }
 
-    /// A decimal number in ASCII, which ends before this byte.
+    /// A decimal number in ASCII that ends before the byte `end`.
     pub const fn decimal_until(end: u8) -> Self {
         Self::of(Kind::Decimal(Digits { width: Width::Until(end), decimals: 0 }))
     }
 
-    /// A hexadecimal number of so many digits in ASCII, 1..=8.
+    /// A hexadecimal number of this many ASCII digits, 1..=8.
     pub const fn hex(width: u8) -> Self {
         Self::of(Kind::Hex(Width::Fixed(width)))
     }
 
-    /// A hexadecimal number in ASCII, which ends before this byte.
+    /// A hexadecimal number in ASCII that ends before the byte `end`.
     pub const fn hex_until(end: u8) -> Self {
         Self::of(Kind::Hex(Width::Until(end)))
     }
@@ -184,29 +183,30 @@ impl Encoding {
         Self::bits(ty, bit..=bit)
     }
 
-    /// Highest byte first.
+    /// Sets the byte order: highest byte first.
     pub const fn big_endian(self) -> Self {
         self.ordered(ByteOrder::Big)
     }
 
-    /// With the bytes in this order.
+    /// Sets the byte order.
     pub const fn ordered(self, order: ByteOrder) -> Self {
         Self { order, ..self }
     }
 
-    /// These bits of a number of so many bytes, as signals of CAN databases are bits of all eight.
+    /// These bits of a number of `bytes` bytes; signals of CAN databases are bits of all eight.
     pub const fn bits_of(bytes: u8, bits: RangeInclusive<u8>) -> Self {
         let (first, last) = (*bits.start(), *bits.end());
         let count = last.saturating_sub(first).saturating_add(1);
         Self::of(Kind::Bits(Bits { bytes, first, count, signed: false }))
     }
 
-    /// Other bits of the number before, or a second use of the same bytes.
+    /// Makes the field begin where the previous one began: for other bits of the same number, or a second use of the
+    /// same bytes.
     pub const fn shared(self) -> Self {
         Self { shared: true, ..self }
     }
 
-    /// The highest of the bits is a sign. No effect on other kinds.
+    /// Makes the highest bit a sign. No effect on other kinds.
     pub const fn signed(mut self) -> Self {
         if let Kind::Bits(bits) = &mut self.kind {
             bits.signed = true;
@@ -214,7 +214,7 @@ impl Encoding {
         self
     }
 
-    /// Written with so many digits behind a point. No effect on what is not decimal.
+    /// Sets the number of digits written after the point. No effect on other kinds.
     pub const fn decimals(mut self, decimals: u8) -> Self {
         if let Kind::Decimal(digits) = &mut self.kind {
             digits.decimals = decimals;
@@ -222,7 +222,7 @@ impl Encoding {
         self
     }
 
-    /// Number of bytes in the frame, the byte that ends the field not included; `None` if it varies.
+    /// Number of bytes in the frame, without a terminating byte; `None` if it varies.
     pub const fn size(&self) -> Option<usize> {
         Some(match self.kind {
             Kind::Scalar(ty) => ty.size(),
@@ -235,7 +235,7 @@ impl Encoding {
         })
     }
 
-    /// The byte that ends the field, if its length varies.
+    /// The byte that terminates the field, if its length varies.
     pub const fn until(&self) -> Option<u8> {
         match self.kind {
             Kind::Decimal(Digits { width: Width::Until(end), .. }) | Kind::Hex(Width::Until(end)) => {
@@ -245,17 +245,17 @@ impl Encoding {
         }
     }
 
-    /// Whether it is written in digits of ASCII.
+    /// Whether the field consists of ASCII digits.
     pub const fn is_digits(&self) -> bool {
         matches!(self.kind, Kind::Decimal(_) | Kind::Hex(_))
     }
 
-    /// Whether all values that are read are integers: digits may have a point, however they are written.
+    /// Whether all received values are integers. Not so for decimal digits, which may always have a point.
     pub const fn reads_integers(&self) -> bool {
         self.is_integer() && !matches!(self.kind, Kind::Decimal(_))
     }
 
-    /// Whether all values that are written are integers.
+    /// Whether all sent values are integers.
     pub const fn is_integer(&self) -> bool {
         match self.kind {
             Kind::Scalar(ty) => !matches!(ty, ScalarType::Float | ScalarType::Double),
@@ -264,7 +264,7 @@ impl Encoding {
         }
     }
 
-    /// The smallest and the largest number that can be written.
+    /// The smallest and the largest number that can be encoded.
     pub fn range(&self) -> (f64, f64) {
         match self.kind {
             Kind::Scalar(ty) => ty.range(),
@@ -285,7 +285,7 @@ impl Encoding {
                 };
                 let point = if decimals == 0 { 0 } else { decimals.saturating_add(1) };
                 let unit = power_of_ten(decimals);
-                // Sixteen digits are more than a binary64 keeps apart.
+                // Sixteen digits exceed the precision of a binary64.
                 let digits = width.saturating_sub(point).saturating_add(decimals);
                 let most = |digits: u8| (power_of_ten(digits.min(15)) - 1.0) / unit;
                 (-most(digits.saturating_sub(1)), most(digits))
@@ -293,8 +293,7 @@ impl Encoding {
         }
     }
 
-    /// The number that is written for `value`: rounded, and inside the range. `None` if it is not a
-    /// number, or if a value that should wrap has more than 53 bits.
+    /// Rounds `value` and brings it into range. `None` for NaN, or if it should wrap and has more than 53 bits.
     pub fn fit(&self, value: f64, overflow: Overflow) -> Option<f64> {
         let (low, high) = self.range();
         if value.is_nan() {
@@ -309,11 +308,10 @@ impl Encoding {
         }
     }
 
-    /// The value of a field's bytes, without the byte that ends it. A float may be infinite or not a
-    /// number.
+    /// Decodes a field's bytes, without the terminating byte. A float may be infinite or NaN.
     ///
     /// # Errors
-    /// [`Unreadable`]: another length, or something that is not a digit.
+    /// [`Unreadable`]: a wrong length, a character that is not a digit, or too many digits.
     pub fn read(&self, bytes: &[u8]) -> Result<Scalar, Unreadable> {
         if self.size().is_some_and(|len| len != bytes.len()) {
             return Err(Unreadable::Length);
@@ -344,9 +342,9 @@ impl Encoding {
         })
     }
 
-    /// Writes `value`, which [`Self::fit`] gave, to the front of `out`, and returns the number of
-    /// bytes; the byte that ends the field is the caller's. Bits are added to those that are there.
-    /// `None`, with nothing written, if `out` is too short.
+    /// Writes `value`, which [`Self::fit`] returned, to the front of `out` and returns the number of bytes; the caller
+    /// writes a terminating byte. Bits are ORed with those in `out`. `None`, with nothing written, if `out` is too
+    /// short.
     pub fn write(&self, value: f64, out: &mut [u8]) -> Option<usize> {
         let len = self.size().unwrap_or(0);
         let raw = match self.kind {
@@ -378,12 +376,12 @@ impl Encoding {
 }
 
 impl Bits {
-    /// The bits, each where it stands in the number.
+    /// The mask of the bits in the number.
     pub(super) const fn mask(&self) -> u64 {
         (mask(self.count) as u64).unbounded_shl(self.first as u32)
     }
 
-    /// The bits in the bytes of the number, in this order; the first byte is the lowest.
+    /// The mask of the bits in the number's bytes, in this order; the first byte is the lowest.
     pub(super) fn places(&self, order: ByteOrder) -> u64 {
         let mut bytes = [0; 8];
         order.write(self.mask(), bytes.get_mut(..usize::from(self.bytes)).unwrap_or(&mut []));
@@ -397,7 +395,7 @@ impl From<ScalarType> for Encoding {
     }
 }
 
-/// The lowest `bits` bits.
+/// A mask of the lowest `bits` bits.
 const fn mask(bits: u8) -> u32 {
     u32::MAX.unbounded_shr(32_u32.saturating_sub(bits as u32))
 }
@@ -424,9 +422,9 @@ fn scalar(ty: ScalarType, raw: u64) -> Scalar {
     }
 }
 
-/// An integer, or an infinite number, into a range of integers: around and around.
+/// Wraps an integer, or an infinite number, into a range of integers.
 pub(crate) fn wrap(value: f64, low: f64, high: f64) -> Option<f64> {
-    // Beyond, a binary64 does not tell neighbouring integers apart.
+    // A binary64 cannot represent all larger integers.
     if !(-9.0e15..=9.0e15).contains(&value) {
         return None;
     }
@@ -446,7 +444,7 @@ fn read_hex(bytes: &[u8]) -> Result<u32, Unreadable> {
     })
 }
 
-/// Blanks before the number, a sign, digits, and perhaps a point with digits behind it.
+/// Accepts blanks before the number, a sign, digits, and an optional point with digits after it.
 fn read_decimal(bytes: &[u8]) -> Result<Scalar, Unreadable> {
     let bytes = bytes.trim_ascii_start();
     let (negative, digits) = match bytes {
@@ -454,7 +452,7 @@ fn read_decimal(bytes: &[u8]) -> Result<Scalar, Unreadable> {
         [b'+', digits @ ..] => (false, digits),
         digits => (false, digits),
     };
-    // Scales put blanks between the sign and the number.
+    // Scales send blanks between the sign and the number.
     let digits = digits.trim_ascii();
     let (mut value, mut decimals, mut count, mut has_point) = (0_u64, 0_u8, 0_u8, false);
     for &byte in digits {
@@ -475,7 +473,7 @@ fn read_decimal(bytes: &[u8]) -> Result<Scalar, Unreadable> {
     if count == 0 {
         return Err(Unreadable::NotADigit);
     }
-    // A binary64 keeps all integers below apart.
+    // A binary64 represents all smaller integers exactly.
     if value >= 1 << 53 {
         return Err(Unreadable::TooLarge);
     }

@@ -1,19 +1,19 @@
-//! Frames between escape bytes: what is sent on the line instead of a frame's own bytes.
+//! Escaping of frames: marks around a frame, and substitutes for its bytes that look like marks.
 //!
-//! In: a frame. Out: its bytes with escapes. The other way is [`Cutter`]'s.
+//! In: a frame. Out: its bytes with escapes. [`Cutter`] does the reverse.
 //!
 //! [`Cutter`]: super::Cutter
 
-/// How a frame is marked, and bytes in it that look like the marks.
+/// A way to mark frames, and to escape bytes inside them that look like marks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Escape {
     /// DLE STX, the frame with every DLE doubled, DLE ETX.
     Dle,
-    /// RFC 1055: END, the frame, END; ESC stands before what END and ESC become.
+    /// RFC 1055: END, the frame, END. END and ESC inside the frame become ESC and another byte.
     Slip,
-    /// Consistent overhead byte stuffing: no byte is zero, a zero ends the frame.
+    /// Consistent overhead byte stuffing: the encoded frame has no zeros, and a zero ends it.
     Cobs,
 }
 
@@ -35,11 +35,10 @@ impl Escape {
         }
     }
 
-    /// Puts escapes into the frame of `len` bytes at the front of `out`, and returns the number of
-    /// bytes then. `None` if there is no room.
+    /// Escapes the frame of `len` bytes at the front of `out` and returns the new length. `None` if `out` is too short.
     pub fn stuff(self, len: usize, out: &mut [u8]) -> Option<usize> {
-        // The frame goes to the end of the room, and from there byte by byte to the front, where it
-        // is never overtaken if all of it fits.
+        // The frame is moved to the end of the buffer and then written byte by byte to the front. If everything fits,
+        // the write position never overtakes the read position.
         let from = out.len().checked_sub(len)?;
         if self.stuffed_len(out.get(..len)?) > out.len() {
             return None;
@@ -80,7 +79,7 @@ impl Escape {
                         writer.put(&[byte])?;
                         code = code.saturating_add(1);
                     }
-                    // The code of a full group stands for no zero, and none follows the last one.
+                    // The code of a full group implies no zero, and no zero follows the last group.
                     let is_last = at.saturating_add(1) == len;
                     if byte == 0 || code == u8::MAX && !is_last {
                         *writer.out.get_mut(code_at)? = code;

@@ -1,35 +1,34 @@
 //! Finds a device's frames in a stream of bytes.
 //!
-//! In: chunks of any size, and a probe that says what bytes are ([`FrameLayout::probe`] of one or
-//! several layouts). Out: frames, good or with a wrong checksum, and counts of everything else. The
-//! caller knows when the line was silent for too long, and calls [`Framer::discard`].
+//! In: chunks of any size, and a probe that classifies bytes ([`FrameLayout::probe`] of one or several layouts). Out:
+//! frames, good or with a wrong checksum, and counts of everything else. The caller knows when the line was silent for
+//! too long and calls [`Framer::discard`].
 //!
-//! After a broken frame one byte is dropped, never a frame's worth, so that a frame inside it is
-//! still found. To look closely at each byte of a stream of false beginnings would be endless work;
-//! beyond [`EFFORT`] steps for each byte received, bytes are dropped unseen.
+//! After a broken frame only one byte is dropped, so a frame inside it is still found. Work is bounded: if probing
+//! takes more than [`EFFORT`] steps per received byte, held bytes are dropped without probing.
 //!
 //! [`FrameLayout::probe`]: super::FrameLayout::probe
 
 use super::layout::Probe;
 use crate::recipe::model::MAX_STREAM_FRAME;
 
-/// Steps that a received byte pays for. It is enough for frames of 30 bytes to be looked for at every
-/// byte; longer ones can have a head, which most bytes are not.
+/// Probe steps allowed per received byte. This is enough to search frames of 30 bytes at every byte; longer frames
+/// should have a head, which most bytes do not match.
 const EFFORT: i32 = 64;
-/// Unused steps are kept for a whole frame's worth of bytes.
+/// Unused steps are saved up to this limit: enough for one frame.
 const MAX_CREDIT: i32 = EFFORT * MAX_STREAM_FRAME as i32;
-/// Twice the longest frame, so that held bytes move to the front once in a frame's worth of bytes.
+/// Twice the longest frame, so that held bytes are moved to the front only once per frame's worth of bytes.
 const BUFFER: usize = 2 * MAX_STREAM_FRAME;
 
 /// What was found in the stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Found<'a> {
-    /// A frame.
+    /// A valid frame.
     Frame(&'a [u8]),
-    /// A frame whose checksum is right and whose constants are another device's.
+    /// A frame with a right checksum, but with the constants of another device.
     Other(&'a [u8]),
-    /// A frame whose checksum is wrong, and which begins behind all frames that were found before; of a framer of
-    /// replies, where one was expected.
+    /// A frame with a wrong checksum that is not inside a frame found before. A framer of replies reports it only where
+    /// a frame is expected.
     Wrong(&'a [u8]),
 }
 
@@ -39,29 +38,29 @@ pub enum Found<'a> {
 pub struct FramerStats {
     /// Frames found.
     pub frames: u32,
-    /// Frames of others.
+    /// Frames of other devices.
     pub others: u32,
-    /// Frames with a wrong checksum, as [`Found::Wrong`] has them.
+    /// Frames with a wrong checksum, as reported by [`Found::Wrong`].
     pub wrong: u32,
     /// Bytes dropped while looking for a frame.
     pub skipped_bytes: u32,
-    /// Those of them that are no part of a frame with a wrong checksum.
+    /// Those of `skipped_bytes` that are not part of a frame with a wrong checksum.
     pub noise_bytes: u32,
     /// Bytes of partial frames that [`Framer::discard`] dropped.
     pub discarded_bytes: u32,
 }
 
-/// Cuts a stream of bytes into frames of any layouts.
+/// Splits a byte stream into frames of any layouts.
 #[derive(Debug, Clone)]
 pub struct Framer {
     buffer: [u8; BUFFER],
     start: u16,
     end: u16,
-    /// How many bytes from the start a frame is expected to begin; `None` if nobody knows.
+    /// Offset from the start at which a frame is expected to begin; `None` if unknown.
     expected: Option<u16>,
-    /// A frame with a wrong checksum is one only where a frame is expected.
+    /// Report a wrong checksum only where a frame is expected.
     is_of_replies: bool,
-    /// Steps that were paid for; negative after too many.
+    /// Remaining probe steps; negative if overdrawn.
     credit: i32,
     stats: FramerStats,
 }
@@ -73,13 +72,13 @@ impl Default for Framer {
 }
 
 impl Framer {
-    /// An empty framer of replies: a wrong checksum ends a request, so it is believed only where a frame is expected,
-    /// which is at first, after a [`Self::discard`] and directly behind another frame.
+    /// An empty framer of replies. A wrong checksum ends a request, so it is reported only where a frame is expected:
+    /// at the beginning, after a [`Self::discard`] and directly after another frame.
     pub const fn of_replies() -> Self {
         Self { is_of_replies: true, ..Self::new() }
     }
 
-    /// An empty framer; the first byte is expected to begin a frame.
+    /// An empty framer. A frame is expected at the first byte.
     pub const fn new() -> Self {
         let stats = FramerStats {
             frames: 0,
@@ -100,11 +99,11 @@ impl Framer {
         }
     }
 
-    /// The next frame. Takes bytes from the front of `chunk`. Call it again with the rest until it
-    /// returns `None`, even when the rest is empty: frames can be held behind a broken one.
+    /// The next frame. Takes bytes from the front of `chunk`. Call it again with the rest until it returns `None`, even
+    /// if the rest is empty: more frames may be held after a broken one.
     ///
-    /// `probe` is always the same between two [`Self::discard`]s, and never asks for more than a
-    /// frame of 512 bytes; `effort` is about how many steps it takes to see that a checksum is wrong.
+    /// `probe` must stay the same between two [`Self::discard`]s, and never ask for more than 512 bytes. `effort` is
+    /// the approximate number of steps to find that a checksum is wrong.
     pub fn next_frame(
         &mut self,
         chunk: &mut &[u8],
@@ -148,7 +147,7 @@ impl Framer {
         }
     }
 
-    /// Whether a frame with a wrong checksum may begin at the start: it is not within one that was found.
+    /// Whether a frame with a wrong checksum may begin at the start, because it is not inside another one.
     const fn may_be_wrong(&self) -> bool {
         match self.expected {
             Some(missing) => missing == 0,
@@ -156,13 +155,13 @@ impl Framer {
         }
     }
 
-    /// The bytes of a possible frame.
+    /// The held bytes, a possible frame.
     pub fn held(&self) -> &[u8] {
         self.buffer.get(usize::from(self.start)..usize::from(self.end)).unwrap_or(&[])
     }
 
-    /// Drops a partial frame, because the line was silent or the layouts changed, and returns its
-    /// number of bytes. What comes next is expected to begin a frame.
+    /// Drops a partial frame, because the line was silent or the layouts changed, and returns its number of bytes. A
+    /// frame is expected next.
     pub fn discard(&mut self) -> usize {
         let dropped = self.held().len();
         self.stats.discarded_bytes = self.stats.discarded_bytes.wrapping_add(dropped as u32);
@@ -170,12 +169,12 @@ impl Framer {
         dropped
     }
 
-    /// Counters since the framer was made.
+    /// Counters since the framer was created.
     pub const fn stats(&self) -> FramerStats {
         self.stats
     }
 
-    /// The frame at the start, which is held no longer.
+    /// Removes the frame at the start from the held bytes.
     fn take(&mut self, len: usize) -> &[u8] {
         let at = usize::from(self.start);
         self.start = self.start.saturating_add(len as u16).min(self.end);
@@ -183,9 +182,9 @@ impl Framer {
         self.buffer.get(at..usize::from(self.start)).unwrap_or(&[])
     }
 
-    /// Drops the byte at the start, and all that there are if the probes have taken too long.
+    /// Drops the byte at the start, or all held bytes if no probe steps remain.
     fn skip(&mut self, steps: usize, is_noise: bool) {
-        // Behind the first byte of a frame with a wrong checksum, its end is expected.
+        // Inside a frame with a wrong checksum, whose end is expected.
         let is_noise = is_noise && !matches!(self.expected, Some(1..));
         self.credit = self.credit.saturating_sub(i32::try_from(steps).unwrap_or(i32::MAX));
         let skipped = if self.credit < 0 { self.end.saturating_sub(self.start) } else { 1 };

@@ -1,12 +1,12 @@
-//! Texts that say that there is nothing to say, such as a scanner's `NOREAD`.
+//! Texts that mean "no result", such as a scanner's `NOREAD`.
 //!
-//! In: a few short texts. Out: whether a text is one of them. They are kept in as many bytes as other
-//! fields have anyway.
+//! In: a few short texts. Out: whether a text is one of them. They are stored in the space that other fields need
+//! anyway.
 
-/// Bytes of all texts of a field, each with one byte more for its length.
+/// Space for all ignored texts of a field; each takes one more byte for its length.
 pub const MAX_IGNORED: usize = 14;
 
-/// Stands for a text of no characters; a length of 0 is the end.
+/// Length code of an empty text; a length of 0 ends the list.
 const EMPTY: u8 = 0xFF;
 
 /// The texts of a field that are ignored.
@@ -14,15 +14,15 @@ const EMPTY: u8 = 0xFF;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Ignored {
-    /// One text behind the other, each behind its length, or [`EMPTY`]; zeros behind the last.
+    /// For each text, its length or [`EMPTY`], then its bytes; zeros after the last text.
     bytes: [u8; MAX_IGNORED],
 }
 
 impl Ignored {
-    /// No text is.
+    /// No text is ignored.
     pub const NONE: Self = Self { bytes: [0; MAX_IGNORED] };
 
-    /// These are; `None` if there is no room for them. A text of no characters may be one of them.
+    /// Ignores these texts, which may include the empty text; `None` if they do not fit.
     pub fn new(texts: &[&[u8]]) -> Option<Self> {
         let mut ignored = Self::NONE;
         let mut free = ignored.bytes.iter_mut();
@@ -55,7 +55,7 @@ impl Ignored {
         self.iter().any(|ignored| ignored == text)
     }
 
-    /// Whether there are none.
+    /// Whether no text is ignored.
     pub fn is_empty(&self) -> bool {
         *self == Self::NONE
     }

@@ -1,8 +1,8 @@
 //! One frame of a device: head, elements, checksum, tail.
 //!
-//! In: bytes that may begin with such a frame, or the numbers to send. Out: whether and how far they
-//! are one and the values in it, or the frame. The elements stay with the caller, so that the frames
-//! of many devices share one pool; every call takes the ones that [`FrameLayout::new`] checked.
+//! In: bytes that may begin with such a frame, or values to send. Out: whether they are a frame, and its values; or the
+//! encoded frame. The caller keeps the elements, so that many devices share one pool, and passes those that
+//! [`FrameLayout::new`] checked to every call.
 
 mod check;
 mod element;
@@ -26,31 +26,31 @@ pub use check::LayoutError;
 pub use element::Element;
 pub use frame_checksum::{Checksum, DataId, MAX_CHECKSUM, MAX_DATA_ID};
 
-/// What carries the frames.
+/// How frames are transported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Carrier {
-    /// A stream of bytes, in which frames must be found; at most 512 bytes.
+    /// A byte stream in which frames must be searched; at most 512 bytes per frame.
     Stream,
-    /// CAN frames, which their id tells apart; at most 8 bytes.
+    /// CAN frames, identified by their id; at most 8 bytes.
     Can,
-    /// A stream in which something else than the fields tells where frames end, such as escape
-    /// bytes; at most 512 bytes.
+    /// A byte stream in which something else than the fields shows where frames end, such as escape bytes; at most 512
+    /// bytes per frame.
     Whole,
 }
 
-/// What bytes are, seen as a frame that begins at the first of them.
+/// What the bytes are if a frame begins at the first one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probe {
-    /// Not the beginning of a frame; it took so many steps to see that.
+    /// Not the beginning of a frame; the number of steps it took to find out.
     No(usize),
-    /// Perhaps the beginning of one; at least so many more bytes are needed to tell.
+    /// Possibly the beginning of a frame; at least this many more bytes are needed.
     Partial(usize),
-    /// A frame of so many bytes.
+    /// A frame; its length in bytes.
     Frame(usize),
-    /// A frame of so many bytes with a checksum that is right, and another constant: not for us.
+    /// A frame with a right checksum, but with another device's constants; its length in bytes.
     Other(usize),
-    /// A frame of so many bytes with a checksum that is wrong.
+    /// A frame with a wrong checksum; its length in bytes.
     Wrong(usize),
 }
 
@@ -68,11 +68,11 @@ pub enum Part {
     Tail,
 }
 
-/// Where a part is in all frames.
+/// The position of a part, the same in all frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Place {
-    /// Its first byte, 0 is the first of the frame; `None` behind a field of varying length.
+    /// Offset of its first byte in the frame; `None` after a field of varying length.
     pub at: Option<usize>,
     /// Number of bytes; `None` if it varies.
     pub len: Option<usize>,
@@ -81,7 +81,7 @@ pub struct Place {
 /// A frame, checked and ready to find, decode and encode.
 #[derive(Debug, Clone)]
 pub struct FrameLayout {
-    // Their lengths in a byte: every port has room for many layouts.
+    // Lengths take one byte, because every port has space for many layouts.
     head: Vec<u8, MAX_DELIMITER, u8>,
     tail: Vec<u8, MAX_DELIMITER, u8>,
     checksum: Option<Checksum>,
@@ -89,12 +89,12 @@ pub struct FrameLayout {
     behind: u8,
     shortest: u16,
     longest: u16,
-    /// Number of bytes behind a text that takes the rest: elements, checksum and tail.
+    /// Number of bytes after a `TextWidth::Rest` text: elements, checksum and tail.
     behind_rest: u16,
 }
 
 impl FrameLayout {
-    /// Checks a frame. A checksum comes with the number of elements before it.
+    /// Checks a frame. `checksum` comes with the number of elements before it.
     ///
     /// # Errors
     /// [`LayoutError`] says which rule is broken, and by which element.
@@ -110,7 +110,7 @@ impl FrameLayout {
             Vec::from_slice(bytes).map_err(|_| LayoutError::DelimiterTooLong { len: bytes.len() })
         };
         let (head, tail) = (delimiter(head)?, delimiter(tail)?);
-        // A frame on CAN has its id, such as the SYNC of CANopen.
+        // An output frame on CAN may be empty: its id is enough, as for CANopen's SYNC.
         let is_sent_on_can = carrier == Carrier::Can && direction == Direction::Output;
         if elements.is_empty() && head.is_empty() && !is_sent_on_can {
             return Err(LayoutError::Empty);
@@ -152,7 +152,7 @@ impl FrameLayout {
         Ok(layout)
     }
 
-    /// The bytes of the whole frame if the fields of varying length have so many.
+    /// Length of the frame if its fields of varying length have the lengths that `varying` returns.
     fn length_with(&self, elements: &[Element], varying: impl Fn(&Element) -> usize) -> usize {
         let mut places = ElementPlaces::new(self, None);
         for element in elements {
@@ -168,22 +168,22 @@ impl FrameLayout {
         (usize::from(self.shortest), usize::from(self.longest))
     }
 
-    /// The bytes behind the fields.
+    /// The bytes after the fields.
     pub fn tail(&self) -> &[u8] {
         &self.tail
     }
 
-    /// What `bytes` are, seen as a frame that begins at the first of them.
+    /// Classifies `bytes` as a frame that begins at the first of them.
     pub fn probe(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> Probe {
         self.probe_to(elements, bytes, None)
     }
 
-    /// What `bytes` are, seen as one whole frame: too few of them are [`Probe::Partial`].
+    /// Classifies `bytes` as one whole frame; [`Probe::Partial`] if there are too few.
     pub fn probe_whole(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> Probe {
         self.probe_to(elements, bytes, Some(bytes.len()))
     }
 
-    /// `end` is where the frame ends, if that is known from outside.
+    /// `end` is the end of the frame, if it is known from outside.
     fn probe_to(
         &self,
         elements: impl IntoIterator<Item: Borrow<Element>>,
@@ -248,8 +248,7 @@ impl FrameLayout {
         }
     }
 
-    /// Whether all constants that `bytes` has completely are those of this frame, so that its beginning may
-    /// be one of ours.
+    /// Whether all constants that are complete in `bytes` match this frame, so that it may be the beginning of one.
     pub(crate) fn agrees(&self, elements: impl IntoIterator<Item: Borrow<Element>>, bytes: &[u8]) -> bool {
         let mut places = ElementPlaces::new(self, None);
         for element in elements {
@@ -273,8 +272,7 @@ impl FrameLayout {
         Some(if sum.text { found.eq_ignore_ascii_case(right) } else { found == right })
     }
 
-    /// The checksum in a frame that [`Self::probe`] found, and the one that would be right; `None`
-    /// without one.
+    /// The checksum in a frame that [`Self::probe`] found, and the right one; `None` if the frame has no checksum.
     pub fn checksums<'f>(
         &self,
         elements: impl IntoIterator<Item: Borrow<Element>>,
@@ -289,15 +287,14 @@ impl FrameLayout {
         Some((found, Vec::from_slice(right.get(..sum.len())?).ok()?))
     }
 
-    /// Tells the parts of the frame in the order of the wire, each with its place. Head and tail are
-    /// left out if they have no bytes.
+    /// Calls back for each part of the frame in wire order, with its place. Head and tail are omitted if empty.
     pub fn parts(
         &self,
         elements: impl IntoIterator<Item: Borrow<Element>>,
         mut tell: impl FnMut(Part, Place),
     ) {
         let mut places = ElementPlaces::new(self, None);
-        // Behind a field of varying length no byte has a number.
+        // After a field of varying length, offsets are unknown.
         let (mut is_numbered, mut shared_is_numbered) = (true, true);
         let checksum = |places: &ElementPlaces, is_numbered: bool| {
             let sum = self.checksum.filter(|_| usize::from(self.behind) == places.nth)?;
@@ -327,8 +324,8 @@ impl FrameLayout {
         }
     }
 
-    /// The elements of a frame that [`Self::probe`] found, each with its value; `None` for what is
-    /// not a value.
+    /// The elements of a frame that [`Self::probe`] found, each with its value; `None` for elements that are not
+    /// values.
     pub fn values(
         &self,
         elements: impl IntoIterator<Item: Borrow<Element>>,
@@ -364,7 +361,7 @@ impl FrameLayout {
         None
     }
 
-    /// The text that the `nth` element of such a frame is; `None` if it is no text.
+    /// The text in the `nth` element of such a frame; `None` if the element is not a text.
     pub fn text<'a>(
         &self,
         elements: impl IntoIterator<Item: Borrow<Element>>,
@@ -394,10 +391,9 @@ impl FrameLayout {
         self.encode_with(elements, value, |_, _| None, out)
     }
 
-    /// Writes a frame to the front of `out` and returns its length. `value` is asked for the number
-    /// of each element that is a value, by its index; `text` writes each text, and returns its
-    /// length. `None` if one is not a number, or cannot be wrapped, if a text does not fit its
-    /// width or the length its field, or if there is no room.
+    /// Writes a frame to the front of `out` and returns its length. `value` returns the number for the value element
+    /// with this index; `text` writes a text and returns its length. `None` if a number is NaN or cannot be wrapped, if
+    /// a text does not fit its width, if the length does not fit its field, or if `out` is too short.
     pub fn encode_with(
         &self,
         elements: impl IntoIterator<Item: Borrow<Element>>,
@@ -430,7 +426,7 @@ impl FrameLayout {
                     continue;
                 }
                 Element::Length(length) => {
-                    // It is written when the length is known.
+                    // Written once the length of the frame is known.
                     let len = length.encoding.size()?;
                     if !element.is_shared() {
                         rest.get_mut(..len)?.fill(0);
@@ -479,7 +475,7 @@ impl FrameLayout {
     }
 }
 
-/// The bytes where a checksum stands, and the right ones, of which it has the first.
+/// The bytes in the checksum's place, and the right checksum, as many bytes of it.
 fn checksums_at<'f>(sum: &Checksum, frame: &'f [u8], at: usize) -> (&'f [u8], [u8; MAX_CHECKSUM]) {
     let found = frame.get(at..at.saturating_add(sum.len())).unwrap_or(&[]);
     let mut right = [0; MAX_CHECKSUM];

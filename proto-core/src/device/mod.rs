@@ -1,9 +1,8 @@
-//! Frames of field devices, beyond what the controller's own recipes can describe
-//! (docs/devices.md): checksums, byte orders, bits, digits, texts,
-//! and what tells one frame from the next.
+//! Frames of field devices, beyond what the controller's own recipes can describe (docs/devices.md): checksums, byte
+//! orders, bits, digits, texts, and the boundaries between frames.
 //!
-//! A recipe with such fields is for a field port. A gripper's status, read by Modbus RTU: slave 9,
-//! function 3, six bytes, a CRC.
+//! A recipe with such fields is for a field port. This one is a gripper's status, read by Modbus RTU: slave 9, function
+//! 3, six bytes, a CRC.
 //!
 //! ```
 //! use proto_core::config::{GatewayConfig, InputField, Port, Recipe};

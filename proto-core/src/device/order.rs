@@ -10,20 +10,20 @@ pub enum ByteOrder {
     Little,
     /// ABCD: highest byte first.
     Big,
-    /// CDAB: words of 16 bits, lowest first; within a word the highest byte first. Common where
-    /// registers of Modbus hold 32 bits.
+    /// CDAB: 16-bit words, lowest first; within a word the highest byte first. Common where Modbus registers hold 32
+    /// bits.
     BigSwapped,
-    /// BADC: words of 16 bits, highest first; within a word the lowest byte first.
+    /// BADC: 16-bit words, highest first; within a word the lowest byte first.
     LittleSwapped,
 }
 
 impl ByteOrder {
-    /// Whether the order says something else than little or big.
+    /// Whether the order is neither little nor big.
     pub const fn swaps_words(self) -> bool {
         matches!(self, Self::BigSwapped | Self::LittleSwapped)
     }
 
-    /// The power of 256 that the byte at `at` counts, in a number of `len` bytes.
+    /// The significance of the byte at `at` in a number of `len` bytes, as a power of 256.
     const fn power(self, at: usize, len: usize) -> usize {
         let from_end = len.saturating_sub(1).saturating_sub(at);
         match self {
@@ -35,13 +35,12 @@ impl ByteOrder {
         }
     }
 
-    /// The number that these bytes, at most eight, are. If the order swaps words, they must be
-    /// whole words.
+    /// Reads a number of at most eight bytes. If the order swaps words, `bytes` must be whole words.
     pub fn read(self, bytes: &[u8]) -> u64 {
         (0..).zip(bytes).fold(0, |number, (at, &byte)| number | place(self.power(at, bytes.len()), byte))
     }
 
-    /// Writes the lowest bytes of a number; see [`Self::read`].
+    /// Writes the lowest bytes of a number; the inverse of [`Self::read`].
     pub fn write(self, number: u64, bytes: &mut [u8]) {
         let len = bytes.len();
         for (at, byte) in (0..).zip(bytes) {

@@ -1,50 +1,49 @@
-//! Texts in a device's frame, and the field that tells how long the frame is.
+//! Texts in a device's frame, and the field with the frame's length.
 //!
-//! In: a field's bytes, or a number of bytes. Out: the text, or where the frame ends. Does not know
-//! what the text is for.
+//! In: a field's bytes, or a number of bytes. Out: the text, or where the frame ends. Does not know the meaning of the
+//! text.
 
 use super::encoding::Encoding;
 
 /// Maximum number of characters of a text.
 pub const MAX_TEXT: usize = 128;
 
-/// A text: bytes that are characters, of any character set.
+/// A text: bytes in any character set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Text {
     /// Number of characters.
     pub width: TextWidth,
-    /// What stands behind a text that is shorter than a fixed width, often a blank. `None`: every
-    /// character counts, and a shorter text is not sent.
+    /// Pads a text that is shorter than a fixed width, often a blank. `None`: every character counts, and a shorter
+    /// text is not sent.
     pub fill: Option<u8>,
 }
 
-/// Where a text ends.
+/// How the end of a text is found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum TextWidth {
-    /// It always has so many characters, 1..=128.
+    /// Always this many characters, 1..=128.
     Fixed(u8),
-    /// Before this byte, which follows the field.
+    /// It ends before this byte, which follows the field.
     Until(u8),
-    /// Where the frame does, but for the elements, the checksum and the tail behind it: in frames
-    /// whose end is known from a length or from outside.
+    /// It takes the rest of the frame, up to the elements, the checksum and the tail after it. The frame's end must be
+    /// known from a length field or from outside.
     Rest,
 }
 
 impl Text {
-    /// The text in a field's bytes: without what fills it up.
+    /// The text in a field's bytes, without padding.
     pub fn trimmed<'a>(&self, field: &'a [u8]) -> &'a [u8] {
         let (TextWidth::Fixed(_), Some(fill)) = (self.width, self.fill) else { return field };
         let end = field.iter().rposition(|&byte| byte != fill).map_or(0, |last| last.saturating_add(1));
         field.get(..end).unwrap_or(field)
     }
 
-    /// Completes a text of `len` characters at the front of `out`: fills it up, or ends it. Returns
-    /// the number of its bytes, without the byte that ends it. `None` if it is too long, too short,
-    /// or has the byte that ends it.
+    /// Pads or terminates a text of `len` characters at the front of `out`. Returns its length without the terminating
+    /// byte; `None` if it is too long or too short, or contains the terminating byte.
     pub(super) fn complete(&self, len: usize, out: &mut [u8]) -> Option<usize> {
         let text = out.get(..len)?;
         match self.width {
@@ -68,16 +67,16 @@ impl Text {
     }
 }
 
-/// A field that tells how many bytes the frame has.
+/// A field with the length of the frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Length {
-    /// How it is written: an integer, not of varying length.
+    /// How it is encoded: an integer of fixed length.
     pub encoding: Encoding,
     /// Which bytes it counts.
     pub counts: Counts,
-    /// So many bytes more than it says: 2 if it leaves out two of those that it should count.
+    /// Added to the received number, such as 2 if the device does not count two bytes of `counts`.
     pub plus: i8,
 }
 
@@ -86,12 +85,12 @@ pub struct Length {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Counts {
-    /// All behind it, checksum and tail included.
+    /// All bytes after it, including checksum and tail.
     #[default]
     Rest,
     /// The whole frame, from its head to its tail.
     Frame,
-    /// The fields behind it, without checksum and tail.
+    /// The fields after it, without checksum and tail.
     Fields,
 }
 

@@ -69,11 +69,11 @@ fn the_last_bytes_of_a_frame_that_was_cut_are_no_frame() {
     assert_eq!(feed(&mut cutter, b"40065", b"\r\n"), []);
     assert_eq!(cutter.discard(), 5);
     assert!(!cutter.has_begun());
-    // Another silence does not make it better.
+    // A second silence does not repair it.
     assert_eq!(feed(&mut cutter, b"94", b"\r\n"), []);
     assert_eq!(cutter.discard(), 2);
     assert_eq!(feed(&mut cutter, b"1\r\n4006594\r\n", b"\r\n"), [Event::Cut, whole(b"4006594\r\n")]);
-    // Silence between frames is nothing.
+    // Silence between frames has no effect.
     assert_eq!(cutter.discard(), 0);
     assert_eq!(feed(&mut cutter, b"1\r\n", b"\r\n"), [whole(b"1\r\n")]);
 }
@@ -95,7 +95,7 @@ fn silence_ends_a_frame() {
     assert_eq!(cutter.silence(), None);
     assert_eq!(feed(&mut cutter, &[4; 600], &[]), []);
     assert_eq!(cutter.silence().map(event), Some(Event::TooLong));
-    // What is dropped is dropped up to the next silence.
+    // The bytes up to the next silence are dropped too.
     assert_eq!(feed(&mut cutter, &[5], &[]), []);
     assert_eq!(cutter.discard(), 1);
     assert_eq!(feed(&mut cutter, &[6], &[]), []);
@@ -136,13 +136,13 @@ fn wrong_escapes_are_told_and_the_next_frame_is_taken() {
     let dle = [9, 0x10, 2, 1, 0x10, 2, 5, 0x10, 3, 8, 0x10, 7, 0x10, 2, 6, 0x10, 9, 6, 0x10, 3];
     let mut cutter = escaped(Escape::Dle);
     assert_eq!(feed(&mut cutter, &dle, &[]), [Event::BadEscape, whole(&[5]), Event::BadEscape]);
-    // 9; 8, DLE, 7; and what followed the wrong escape.
+    // 9; 8, DLE, 7; and the bytes after the invalid escape.
     assert_eq!(cutter.skipped_bytes(), 1 + 3 + 3);
     let cobs = [5, 1, 2, 0, 2, 7, 0];
     assert_eq!(feed(&mut escaped(Escape::Cobs), &cobs, &[]), [Event::BadEscape, whole(&[7])]);
 }
 
-/// Splits a stream at each end, then looks at each piece alone.
+/// Splits the stream at all ends first, then decodes each piece separately.
 fn reference(escape: Escape, stream: &[u8]) -> Vec<Event> {
     let mut events = Vec::new();
     match escape {

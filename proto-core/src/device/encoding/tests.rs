@@ -136,7 +136,7 @@ fn numbers_wrap_only_where_asked() {
     assert_eq!(byte.fit(f64::NAN, Overflow::Usual), None);
     assert_eq!(byte.fit(f64::INFINITY, Overflow::Usual), Some(255.0));
     assert_eq!(byte.fit(f64::INFINITY, Overflow::Wrap), None);
-    // A float does not wrap.
+    // Floats do not wrap.
     assert_eq!(Encoding::scalar(ScalarType::Float).fit(1e300, Overflow::Wrap), Some(f64::from(f32::MAX)));
 }
 
@@ -214,7 +214,7 @@ proptest! {
         if let Ok(value) = encoding.read(&bytes) {
             let (low, high) = encoding.range();
             let number = value.as_f64();
-            // What is read may have more digits behind the point than are written.
+            // Received numbers may have more digits after the point than sent ones.
             if value.is_finite() && !matches!(encoding.kind, Kind::Decimal(_)) {
                 prop_assert!(low <= number && number <= high, "{:?} is {}", encoding, number);
             }
@@ -222,8 +222,8 @@ proptest! {
     }
 }
 
-/// Signals of CAN databases: the 12 bits from bit 28 of a message of 8 bytes on, which lie in its bytes
-/// 3 and 4, and the same in Motorola's order.
+/// Signals of CAN databases: 12 bits from bit 28 of an 8-byte message, in its bytes 3 and 4, and the same in Motorola
+/// order.
 #[test]
 fn bits_of_eight_bytes_cross_any_byte() {
     let intel = Encoding::bits_of(8, 28..=39);
@@ -235,7 +235,7 @@ fn bits_of_eight_bytes_cross_any_byte() {
     let mut bytes = [0; 8];
     motorola.write(f64::from(0xABC), &mut bytes);
     assert_eq!(bytes, [0, 0, 0, 0xAB, 0xC0, 0, 0, 0]);
-    // Side by side, signed, and as wide as they can be.
+    // Adjacent fields, signed, and of the maximum width.
     let highest = Encoding::bits_of(8, 32..=63).signed();
     highest.write(-2.0, &mut bytes);
     assert_eq!(highest.read(&bytes), Ok(Scalar::Int(-2)));

@@ -82,7 +82,7 @@ fn a_wrong_checksum_is_told_once_and_the_next_frame_is_taken() {
     broken[2] ^= 1;
     let mut framer = Framer::new();
     let events = run(&mut framer, &[&[broken.clone(), broken.clone(), frame([1, 2])].concat()]);
-    // The false beginning inside, a value that looks like a head, is not told.
+    // The false beginning inside, a value that looks like a head, is not reported.
     let expected = [Event::Wrong(broken.clone()), Event::Wrong(broken), Event::Frame(frame([1, 2]))];
     assert_eq!(events, expected);
     let stats = framer.stats();
@@ -93,7 +93,7 @@ fn a_wrong_checksum_is_told_once_and_the_next_frame_is_taken() {
 fn each_broken_frame_counts_whatever_is_between_them() {
     let mut broken = frame([1, 7]);
     broken[2] ^= 1;
-    // A line that is turned round gives such a byte before each frame.
+    // A line produces such a byte before each frame when its direction changes.
     let stream = [&[0x55][..], &broken, &[0x55, 0x01], &broken, &broken, &[0x55], &frame([1, 2])].concat();
     let mut framer = Framer::new();
     let wrong = || Event::Wrong(broken.clone());
@@ -105,8 +105,8 @@ fn each_broken_frame_counts_whatever_is_between_them() {
     assert_eq!(run(&mut framer, &[&broken]), [wrong()]);
 }
 
-/// All frames of five bytes that begin with the head, and whether their checksum is right: a right one is taken, a
-/// wrong one counts unless it begins within another that counts.
+/// Counts all frames of five bytes that begin with the head, right or wrong. A wrong one counts unless it begins inside
+/// another that counts.
 fn slowly(stream: &[u8]) -> (usize, usize) {
     let (elements, layout) = small();
     let (mut right, mut wrong, mut at, mut until) = (0, 0, 0, 0);
@@ -147,7 +147,7 @@ proptest! {
 
 #[test]
 fn a_frame_inside_a_broken_one_is_found() {
-    // A byte was lost, so the next frame begins where this one should end.
+    // A byte was lost: the next frame begins where the last byte of this one should be.
     let stream = [&frame([1, 2])[..4], &frame([3, 4])[..]].concat();
     let events = run(&mut Framer::new(), &[&stream]);
     assert_eq!(events.last(), Some(&Event::Frame(frame([3, 4]))));
@@ -164,7 +164,7 @@ fn silence_discards_what_is_partial() {
 
 #[test]
 fn a_frame_behind_much_noise_is_taken() {
-    // Whatever the noise is: no byte of it is a head.
+    // Noise without heads.
     let noise: Vec<u8> =
         (0..100_000_u32).map(|nth| (nth.wrapping_mul(2_654_435_761) >> 24) as u8 & 0x7F).collect();
     let events = run(&mut Framer::new(), &[&noise, &frame([1, 2])]);
@@ -198,7 +198,7 @@ fn endless_false_beginnings_cost_bounded_work() {
     while framer.next_frame(&mut rest, effort, probe).is_some() {}
     let steps = *probes.get_mut() * effort;
     assert!(steps <= stream.len() * EFFORT as usize + effort, "{steps} steps");
-    // And a good frame after a pause is taken.
+    // After a discard, a good frame is accepted.
     framer.discard();
     let mut out = [0; 512];
     let zero = |_: usize| 0.0;
@@ -208,7 +208,7 @@ fn endless_false_beginnings_cost_bounded_work() {
     assert_eq!(found, Some(Found::Frame(&out[..len])));
 }
 
-/// What a reader with all bytes before it would find, a byte at a time.
+/// The frames that a reader finds if it tries every byte with all bytes available.
 fn reference(stream: &[u8]) -> Vec<Vec<u8>> {
     let (elements, layout) = small();
     let (mut at, mut frames) = (0, Vec::new());

@@ -1,4 +1,4 @@
-//! What is wrong with the elements, the texts or the checksum of a frame.
+//! Errors in the elements, texts or checksum of a frame.
 
 use core::fmt;
 
@@ -12,7 +12,7 @@ use crate::recipe::model::{MAX_DELIMITER, MAX_FIELDS};
 use crate::sysvar::Direction;
 use crate::wire::scalar::ScalarType;
 
-/// Why a frame cannot be laid out.
+/// Why a frame's layout is invalid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -33,21 +33,20 @@ pub enum LayoutError {
         /// Number of bytes that the carrier allows.
         room: usize,
     },
-    /// Nothing tells where a frame begins: no head, no tail, no checksum, no constant.
+    /// Nothing marks the beginning of a frame: it has no head, tail, checksum or constant.
     NothingToFind,
-    /// A parameter of an element's encoding is out of range, such as bits that its number does not
-    /// have.
+    /// A parameter of an element's encoding is out of range, such as bits beyond its number.
     Encoding {
         /// Index of the element.
         element: u8,
     },
-    /// The order swaps words, but the element does not consist of whole words.
+    /// The byte order swaps words, but the element does not consist of whole words.
     NotWords {
         /// Index of the element.
         element: u8,
     },
-    /// An element shares its place with one that is shorter; or, in an output part, bits share a
-    /// number with what is no bits, or bits of another number, or has one of these bits.
+    /// An element shares the place of a shorter one. Or, in an output part, bits share a number with an element that is
+    /// not bits or is part of another number, or overlap its bits.
     NotShared {
         /// Index of the element.
         element: u8,
@@ -59,27 +58,26 @@ pub enum LayoutError {
     },
     /// The parameters are not those of a CRC.
     Algorithm,
-    /// The checksum stands behind more elements than there are, or between bits of one number.
+    /// The checksum is after more elements than there are, or between bits of one number.
     ChecksumPlace,
-    /// The checksum covers nothing, itself, the tail, or bytes behind a field of varying length.
+    /// The checksum covers nothing, itself, the tail, or bytes after a field of varying length.
     ChecksumRange,
-    /// The frame begins with a text or with what may be anything, so that the last bytes of another
-    /// frame could be taken for it.
+    /// The frame begins with a text or with arbitrary bytes, so the end of another frame could be mistaken for it.
     NoBeginning {
         /// Index of the text.
         element: u8,
     },
-    /// Nothing tells where the frame and its last text end.
+    /// Nothing shows where the frame and its last text end.
     NoEnd {
         /// Index of the text.
         element: u8,
     },
-    /// A field of varying length behind a text that takes the rest of the frame.
+    /// A field of varying length follows a `TextWidth::Rest` text.
     BehindRest {
         /// Index of the field.
         element: u8,
     },
-    /// A length that is no integer, varies in its own length, or is the second one.
+    /// A length field that is not an integer, has a varying length itself, or is the second one.
     Length {
         /// Index of the element.
         element: u8,
@@ -134,7 +132,7 @@ impl fmt::Display for LayoutError {
 impl core::error::Error for LayoutError {}
 
 impl LayoutError {
-    /// Index of the element that it is about.
+    /// Index of the faulty element.
     pub const fn element(&self) -> Option<u8> {
         match *self {
             Self::Encoding { element }
@@ -149,14 +147,14 @@ impl LayoutError {
         }
     }
 
-    /// Whether it is about the checksum.
+    /// Whether the error concerns the checksum.
     pub const fn is_of_checksum(&self) -> bool {
         matches!(self, Self::Algorithm | Self::ChecksumPlace | Self::ChecksumRange)
     }
 }
 
 impl FrameLayout {
-    /// Where texts begin and end, and what is behind one that takes the rest.
+    /// Checks the beginnings and ends of texts, and the elements after a `TextWidth::Rest` text.
     pub(super) fn check_texts(&mut self, is_searched: bool, elements: &[Element]) -> Result<(), LayoutError> {
         let mut begins = !is_searched || !self.head.is_empty() || self.checksum.is_some();
         let mut ends = !is_searched;
@@ -177,7 +175,7 @@ impl FrameLayout {
                 _ => {}
             }
             if element.is_rest() {
-                // A checksum right behind the text is behind it, too.
+                // A checksum directly after the text also counts as behind it.
                 rest_from = Some(places.at);
             }
             places.next(element, element.len().unwrap_or(0), 0);
@@ -196,7 +194,7 @@ impl FrameLayout {
         if !is_valid || sum.order.swaps_words() {
             return Err(LayoutError::Algorithm);
         }
-        // Behind a field of varying length no byte has a number.
+        // After a field of varying length, offsets are unknown.
         let mut places = ElementPlaces::new(self, None);
         let mut numbered = None;
         for element in elements {
@@ -212,7 +210,7 @@ impl FrameLayout {
         let overlaps = covered.start < own.end && own.start < covered.end;
         let end = if sum.last().is_some() { numbered.unwrap_or(places.at) } else { places.at };
         let comes_late = numbered.is_some_and(|numbered| usize::from(sum.first) > numbered);
-        // An empty text leaves nothing to cover.
+        // If a text is empty, the checksum may cover nothing.
         let covers_nothing = covered.is_empty() && (numbered.is_none() || covered.start > covered.end);
         if covers_nothing || overlaps || covered.end > end || comes_late {
             return Err(LayoutError::ChecksumRange);
@@ -222,8 +220,7 @@ impl FrameLayout {
 }
 
 pub(super) fn check_elements(elements: &[Element], direction: Direction) -> Result<(), LayoutError> {
-    // The newest element that shares its place with none before: its length and the byte that ends
-    // it, its order, and which of its bits are taken.
+    // The newest element that is not shared (length, terminating byte, order), and which of its bits are used.
     let mut place: Option<(Encoding, u64)> = None;
     let mut has_length = false;
     for (nth, element) in elements.iter().enumerate() {
@@ -262,7 +259,7 @@ pub(super) fn check_elements(elements: &[Element], direction: Direction) -> Resu
     Ok(())
 }
 
-/// Whether `second` may have the place of `first`; `both` are the bits that both have.
+/// Whether `second` may share the place of `first`; `both` are the bits used by both.
 fn may_share(first: &Encoding, second: &Encoding, both: u64, direction: Direction) -> bool {
     match direction {
         Direction::Input => match (first.size(), second.size()) {
@@ -284,7 +281,7 @@ fn check_encoding(encoding: &Encoding, element: u8) -> Result<(), LayoutError> {
         Kind::Hex(Width::Fixed(width)) => in_range(width, 8),
         Kind::Hex(Width::Until(end)) => !end.is_ascii_hexdigit(),
         Kind::Decimal(Digits { width: Width::Fixed(width), decimals }) => {
-            // A sign, a digit and a point stand before the decimals.
+            // The decimals need a sign, a digit and a point before them.
             let least = if decimals == 0 { 1 } else { usize::from(decimals).saturating_add(3) };
             in_range(width, MAX_DIGITS) && usize::from(width) >= least
         }

@@ -1,4 +1,4 @@
-//! One element of a frame, and how many bytes it takes.
+//! One element of a frame, and its length.
 
 use crate::device::encoding::{Bits, Encoding, Kind, MAX_DIGITS, Overflow};
 use crate::device::text::{Length, MAX_TEXT, Text, TextWidth};
@@ -9,38 +9,38 @@ use crate::device::text::{Length, MAX_TEXT, Text, TextWidth};
 pub enum Element {
     /// A value.
     Value {
-        /// How it is written.
+        /// How it is encoded.
         encoding: Encoding,
-        /// What is sent for a number that it cannot hold.
+        /// What happens if a number is out of range.
         overflow: Overflow,
     },
-    /// A value that is always the same: a frame with another one is not this frame.
+    /// A constant: a frame with another value is not this frame.
     Fixed {
-        /// How it is written.
+        /// How it is encoded.
         encoding: Encoding,
         /// The value, an integer.
         value: i64,
     },
-    /// Bytes without a meaning: any are accepted.
+    /// Bytes without meaning; any value is accepted.
     Padding {
         /// Number of bytes, 1 or more.
         len: u8,
-        /// What is sent.
+        /// The byte that is sent.
         fill: u8,
     },
     /// Characters.
     Text(Text),
-    /// The frame's length.
+    /// The length of the frame.
     Length(Length),
 }
 
 impl Element {
-    /// A value that is written like this, or the nearest that fits.
+    /// A value with this encoding; a number out of range is sent as the nearest one in range.
     pub const fn value(encoding: Encoding) -> Self {
         Self::Value { encoding, overflow: Overflow::Usual }
     }
 
-    /// How it is written; `None` for padding and text.
+    /// How the element is encoded; `None` for padding and text.
     pub const fn encoding(&self) -> Option<Encoding> {
         match *self {
             Self::Value { encoding, .. } | Self::Fixed { encoding, .. } => Some(encoding),
@@ -49,7 +49,7 @@ impl Element {
         }
     }
 
-    /// The byte that ends it, if its length varies.
+    /// The byte that terminates the element, if its length varies.
     pub(super) fn until(&self) -> Option<u8> {
         match self {
             Self::Text(Text { width: TextWidth::Until(end), .. }) => Some(*end),
@@ -62,7 +62,7 @@ impl Element {
         matches!(self, Self::Text(Text { width: TextWidth::Rest, .. }))
     }
 
-    /// Maximum number of bytes, with the one that ends it; 0 if it is shared.
+    /// Maximum number of bytes, including the terminating byte; 0 if shared.
     pub(crate) fn longest(&self) -> usize {
         match self.len() {
             _ if self.is_shared() => 0,
@@ -71,7 +71,7 @@ impl Element {
         }
     }
 
-    /// Maximum number of bytes if its length varies.
+    /// Maximum number of bytes, if the length varies.
     pub(super) const fn most(&self) -> usize {
         match self {
             Self::Text(_) => MAX_TEXT,

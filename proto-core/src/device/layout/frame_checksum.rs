@@ -1,4 +1,4 @@
-//! The checksum of a frame: which bytes it covers, and how it is written.
+//! The checksum of a frame: its algorithm, encoding and range.
 
 use crate::device::checksum::Algorithm;
 use crate::device::order::ByteOrder;
@@ -17,16 +17,16 @@ pub struct Checksum {
     pub order: ByteOrder,
     /// Written as two hexadecimal digits in ASCII for each byte.
     pub text: bool,
-    /// The first byte of the frame that it covers; 0 is the first of the head.
+    /// Offset of the first covered byte; 0 is the first byte of the head.
     pub first: u16,
-    /// The byte behind the last one; 0 is that of the checksum.
+    /// Where the covered bytes end: the byte after the last one; 0 stands for the checksum's own position.
     pub end: u16,
-    /// Bytes that it covers although they are not in the frame.
+    /// Additional covered bytes that are not in the frame.
     pub data_id: DataId,
 }
 
-/// Bytes that a checksum covers beside those of the frame, so that a frame for somebody else has
-/// another one.
+/// Bytes that are covered by a checksum but not in the frame, so that frames for another receiver have another
+/// checksum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -40,17 +40,17 @@ pub struct DataId {
 pub const MAX_DATA_ID: usize = 4;
 
 impl DataId {
-    /// No bytes.
+    /// No additional bytes.
     pub const NONE: Self = Self { bytes: [0; MAX_DATA_ID], len: 0, is_behind: false };
 
-    /// These bytes, before those of the frame; `None` if there are more than four.
+    /// `bytes`, before those of the frame; `None` if there are more than four.
     pub fn new(bytes: &[u8]) -> Option<Self> {
         let mut id = Self { len: bytes.len() as u8, ..Self::NONE };
         id.bytes.get_mut(..bytes.len())?.iter_mut().zip(bytes).for_each(|(slot, &byte)| *slot = byte);
         Some(id)
     }
 
-    /// The same, behind those of the frame.
+    /// Puts the bytes after those of the frame.
     pub const fn behind(self) -> Self {
         Self { is_behind: true, ..self }
     }
@@ -60,20 +60,19 @@ impl DataId {
         self.bytes.get(..usize::from(self.len)).unwrap_or(&[])
     }
 
-    /// Whether they are behind those of the frame.
+    /// Whether the bytes come after those of the frame.
     pub const fn is_behind(&self) -> bool {
         self.is_behind
     }
 }
 
 impl Checksum {
-    /// This algorithm as its standard has it: over everything before it, in the standard's byte
-    /// order.
+    /// This algorithm with its standard byte order, over everything before the checksum.
     pub const fn standard(algorithm: Algorithm) -> Self {
         Self { algorithm, order: algorithm.order(), text: false, first: 0, end: 0, data_id: DataId::NONE }
     }
 
-    /// Over these bytes of the frame, the last one included; `None` is the one before the checksum.
+    /// Covers the bytes of the frame from `first` to `last`, inclusive; `None` is the byte before the checksum.
     pub const fn over(self, first: u16, last: Option<u16>) -> Self {
         let end = match last {
             Some(last) => last.saturating_add(1),
@@ -82,33 +81,33 @@ impl Checksum {
         Self { first, end, ..self }
     }
 
-    /// Over these bytes too, which are not in the frame.
+    /// Also covers these bytes, which are not in the frame.
     pub const fn with_data_id(self, data_id: DataId) -> Self {
         Self { data_id, ..self }
     }
 
-    /// The last byte that it covers; `None` is the one before the checksum.
+    /// Offset of the last covered byte; `None` is the byte before the checksum.
     pub const fn last(&self) -> Option<u16> {
         self.end.checked_sub(1)
     }
 
-    /// Number of bytes in the frame, 1..=8.
+    /// Length in the frame, 1..=8 bytes.
     pub const fn len(&self) -> usize {
         self.algorithm.len().saturating_mul(if self.text { 2 } else { 1 })
     }
 
-    /// Whether it has no bytes: never, for a valid algorithm.
+    /// Whether the length is 0: never, if the algorithm is valid.
     pub const fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The bytes it covers, if it stands at `at` itself.
+    /// Range of the covered bytes, for a checksum at offset `at`.
     pub(super) fn covered(&self, at: usize) -> core::ops::Range<usize> {
         let end = self.last().map_or(at, |last| usize::from(last).saturating_add(1));
         usize::from(self.first)..end
     }
 
-    /// The bytes that stand for the checksum of `covered`.
+    /// Writes the checksum of `covered` as it is in the frame.
     pub(super) fn write(&self, covered: &[u8], out: &mut [u8]) {
         let id = self.data_id.bytes();
         let (before, behind) = if self.data_id.is_behind { (&[][..], id) } else { (id, &[][..]) };

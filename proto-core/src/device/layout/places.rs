@@ -1,34 +1,34 @@
-//! Where the elements of a frame and its checksum are.
+//! Positions of a frame's elements and checksum.
 
 use super::FrameLayout;
 use super::element::Element;
 use crate::device::text::{Counts, Length, MAX_TEXT};
 
-/// The places of elements, one after the other.
+/// Computes the positions of elements one after the other.
 pub(super) struct ElementPlaces {
-    /// Where the next element begins.
+    /// Start of the next element.
     pub(super) at: usize,
-    /// Where the newest element begins that shares its place with none before, and its length.
+    /// Start and length of the newest element that is not shared.
     pub(super) shared_at: usize,
     shared_len: usize,
-    /// Elements that have been placed.
+    /// Number of elements placed so far.
     pub(super) nth: usize,
-    /// How many of them stand before the checksum.
+    /// Number of elements before the checksum.
     checksum_behind: usize,
     checksum_len: usize,
-    /// Where the checksum stands, once it is known.
+    /// Start of the checksum, once it is known.
     pub(super) checksum_at: usize,
     tail_len: usize,
-    /// Where the frame ends, once it is known.
+    /// End of the frame, once it is known.
     pub(super) end: Option<usize>,
     behind_rest: usize,
 }
 
-/// Why the place of an element is unknown.
+/// Why the position of an element is unknown.
 pub(super) enum Unplaced {
-    /// The bytes end before it does; at least so many are missing.
+    /// The bytes end too early; at least this many are missing.
     Partial(usize),
-    /// It is too long.
+    /// The element is too long.
     No,
 }
 
@@ -59,8 +59,7 @@ impl ElementPlaces {
         }
     }
 
-    /// The place of the next element, whose length is `len`, with `further` bytes behind it that
-    /// belong to it.
+    /// The range of the next element, which has `len` bytes, followed by `further` bytes that belong to it.
     pub(super) fn next(&mut self, element: &Element, len: usize, further: usize) -> core::ops::Range<usize> {
         self.nth = self.nth.saturating_add(1);
         if element.is_shared() {
@@ -76,7 +75,7 @@ impl ElementPlaces {
         start..end
     }
 
-    /// The place of the next element in `bytes`.
+    /// Finds the range of the next element in `bytes`.
     pub(super) fn find(
         &mut self,
         element: &Element,
@@ -111,8 +110,8 @@ impl ElementPlaces {
         }
     }
 
-    /// Number of bytes of a frame whose length field, which ends at `at`, says 0. To be called
-    /// behind that field.
+    /// Length of a frame whose length field, which ends at `at`, has the value 0. Call it right after placing that
+    /// field.
     pub(super) fn counted_from(&self, length: &Length, at: usize) -> i64 {
         let first = match length.counts {
             Counts::Frame => 0,

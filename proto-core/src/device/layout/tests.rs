@@ -78,13 +78,13 @@ fn a_reply_with_constants_and_a_crc() {
     assert_eq!(frame[9..], crc.to_le_bytes());
     assert_eq!(decoded(&layout, &elements, &frame), [1.0, 1.0, 3.0, 0.0, 230.0, 66.0, 5.0]);
 
-    // Any flipped bit is found.
+    // Every flipped bit is detected.
     for bit in 0..frame.len() * 8 {
         let mut broken = frame.clone();
         broken[bit / 8] ^= 1 << (bit % 8);
         assert_eq!(layout.probe(&elements, &broken), Probe::Wrong(11), "bit {bit}");
     }
-    // Another slave's frame is right, and not ours.
+    // Another slave's frame is valid, but not for us.
     let mut other = frame.clone();
     other[0] = 8;
     let crc = Algorithm::named("crc16-modbus").unwrap().of([&other[..9]]) as u16;
@@ -133,7 +133,7 @@ fn a_checksum_stands_where_its_device_has_it() {
 
 #[test]
 fn a_checksum_in_digits() {
-    // Modbus ASCII: LRC of the bytes... of this frame's own, in two digits.
+    // Like Modbus ASCII, with an LRC in two digits.
     let elements = [value(Kind::Hex(Width::Fixed(4)), ByteOrder::Big)];
     let sum = Checksum { text: true, first: 1, ..Checksum::standard(Algorithm::Sum8) };
     let layout =
@@ -163,7 +163,7 @@ fn fields_of_varying_length_end_where_their_delimiter_is() {
     }
     assert_eq!(layout.probe(&elements, b"ST,17,123456789012345678\r\n"), Probe::No(4), "too long");
     assert_eq!(layout.probe(&elements, b"SA"), Probe::No(2), "seen at once");
-    // Found, and refused by its value.
+    // Found, but its value is rejected.
     let frame = b"ST,x,1\r\n";
     assert_eq!(layout.probe(&elements, frame), Probe::Frame(8));
     assert_eq!(layout.values(&elements, frame).next(), Some(Err(Unreadable::NotADigit)));
@@ -214,7 +214,7 @@ fn what_cannot_be_laid_out_is_refused() {
     assert_eq!(with(bits(0, 1, true)), shared, "no bits before");
     assert_eq!(new(&[bits(0, 2, false), bits(1, 1, true)]), shared, "the same bit");
     assert_eq!(new(&[bits(0, 2, false), bits(2, 6, true)]), Ok((2, 2)));
-    // What is received may be used twice.
+    // Received bytes may be used twice.
     let twice = Element::value(Encoding { shared: true, ..Encoding::scalar(ScalarType::Byte) });
     assert_eq!(with(twice), shared);
     let input = |elements: &[Element]| {
@@ -239,7 +239,7 @@ fn length(counts: Counts, plus: i8) -> Element {
     Element::Length(Length { encoding: Encoding::scalar(ScalarType::Byte), counts, plus })
 }
 
-/// A length, a byte, and a text; CRC and tail as asked.
+/// A length, a byte, and a text; checksum and tail as requested.
 fn sized(counts: Counts, plus: i8, checked: bool) -> (Vec<Element>, FrameLayout) {
     let elements = vec![length(counts, plus), fixed(ScalarType::Byte, 7), text(TextWidth::Rest)];
     let checksum = if checked { standard("crc16-modbus", 3) } else { None };
@@ -371,7 +371,7 @@ fn the_rest_ends_before_what_is_behind_it() {
 }
 
 proptest! {
-    /// The same frames as a reader that looks at each length alone, whatever the stream.
+    /// The same frames as from a reader that tries each length separately, for any stream.
     #[test]
     fn frames_with_a_length_are_those_of_a_slow_reader(
         stream in prop::collection::vec(prop::sample::select(vec![2_u8, 3, 4, 5, 7, b'A']), 0..60),
@@ -447,9 +447,9 @@ fn the_checksum_in_a_frame_is_told_with_the_right_one() {
     assert_eq!(plain.unwrap().checksums(&elements, b"$AB,\r\n"), None);
 }
 
-/// The examples of AUTOSAR's document 849 (E2E protocol specification, R20-11) for profile 11, with
-/// which profile 1 is interoperable, and for profile 22 with one data id; the crate autosar-e2e 1.0.0
-/// tests the same bytes. All data is zero.
+/// Examples of AUTOSAR document 849 (E2E protocol specification, R20-11) for profile 11, with which profile 1 is
+/// interoperable, and for profile 22 with one data id; the crate autosar-e2e 1.0.0 tests the same bytes. All data is
+/// zero.
 #[test]
 fn a_checksum_covers_a_data_id_that_is_not_in_the_frame() {
     let counter = fixed(ScalarType::Byte, 0);
@@ -473,7 +473,7 @@ fn a_checksum_covers_a_data_id_that_is_not_in_the_frame() {
     let both = DataId::new(&0x123_u16.to_le_bytes()).unwrap();
     assert_eq!(frame("crc8-gsm-a", both, 0), (0xCC, 0x00));
     assert_eq!(frame("crc8-gsm-a", both, 1), (0x91, 0x01));
-    // The high nibble of the id is in the frame.
+    // The high nibble of the id is part of the frame.
     let nibble = DataId::new(&[0x23, 0]).unwrap();
     assert_eq!(frame("crc8-gsm-a", nibble, 0x10), (0x2A, 0x10));
     assert_eq!(frame("crc8-gsm-a", nibble, 0x11), (0x77, 0x11));
