@@ -1,9 +1,7 @@
-//! The compiled part of a CAN recipe: frame ids, each with its fields
-//! (docs/wire/recipes.md section 6).
+//! The compiled part of a CAN recipe: frame ids, each with its fields (docs/wire/recipes.md section 6).
 //!
-//! In: a [`CanFrame`] or anything else that is an [`embedded_can::Frame`], or the process image.
-//! Out: the other. A frame
-//! that is not of the recipe is rejected with a reason to count, and never applied in part.
+//! In: a [`CanFrame`] or any other [`embedded_can::Frame`], or the process image. Out: the other. A frame that does not
+//! match the recipe is rejected with a reason to count, and never applied in part.
 
 use embedded_can::Frame;
 use heapless::Vec;
@@ -15,7 +13,7 @@ use crate::sysvar::IMAGE_BYTES;
 use crate::wire::can::{CanFrame, CanId, CanKey, MAX_CAN_DATA};
 use crate::wire::scalar::Scalar;
 
-/// Why a received frame is not a frame of the recipe (D17).
+/// Why a received frame does not match the recipe (D17).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -30,7 +28,7 @@ pub enum CanReject {
         /// The received id.
         id: CanId,
     },
-    /// The data is not as long as the fields.
+    /// The length of the data is not that of the fields.
     WrongLength {
         /// The frame's index in the part.
         frame: u8,
@@ -45,10 +43,10 @@ pub enum CanReject {
 #[derive(Debug, Clone)]
 pub struct CanLayout {
     rules: Rules,
-    /// The frames' ids, in one word each, as many as `shares`. The rest is [`CanKey::NONE`].
+    /// The ids of the frames, as many as `shares`, then [`CanKey::NONE`].
     keys: [CanKey; MAX_CAN_IDS],
     shares: Vec<Share, MAX_CAN_IDS>,
-    /// Places of the ids: indices of frames, or [`EMPTY`]. See [`CanLayout::search_order`].
+    /// Hash table of the ids: indices of frames, or [`EMPTY`]. See [`CanLayout::search_order`].
     places: [u8; PLACES],
     pool: Pool,
 }
@@ -63,7 +61,7 @@ pub struct CanFrameLayout<'a> {
 }
 
 impl CanLayout {
-    /// Checks a part and compiles it; each frame is its id and its fields.
+    /// Checks and compiles a part; each frame is its id and its fields.
     ///
     /// # Errors
     /// [`PartError`] says which limit or rule is broken, and by which frame or field.
@@ -94,19 +92,19 @@ impl CanLayout {
         self.shares.len()
     }
 
-    /// The index of the part's frame that a received frame is.
+    /// The index in the part of the frame that matches a received frame.
     ///
     /// # Errors
-    /// [`CanReject`]: another id, a remote frame, or another length.
+    /// [`CanReject`]: an unknown id, a remote frame, or a wrong length.
     pub fn accept(&self, frame: &impl Frame) -> Result<usize, CanReject> {
         let key = CanKey::of(frame.id().into());
         self.accept_parts(key, frame.is_remote_frame(), frame.data().len())
     }
 
-    /// The same for a frame whose id was checked when it was made, and is not checked again.
+    /// Like [`Self::accept`], without checking the id, which a [`CanFrame`] guarantees to be valid.
     ///
     /// # Errors
-    /// [`CanReject`]: another id, a remote frame, or another length.
+    /// [`CanReject`]: an unknown id, a remote frame, or a wrong length.
     pub fn accept_frame(&self, frame: &CanFrame) -> Result<usize, CanReject> {
         self.accept_parts(frame.key(), frame.is_remote(), frame.len())
     }
@@ -129,7 +127,7 @@ impl CanLayout {
         Ok(index)
     }
 
-    /// Whether the part has a frame with the id of this one.
+    /// Whether the part has a frame with this frame's id.
     pub(crate) fn has(&self, frame: &CanFrame) -> bool {
         self.index_of(frame.key()).is_some()
     }
@@ -184,23 +182,22 @@ impl CanLayout {
         }
         let whole = self.pool.whole(first_step, len);
         let share = Share { first_field: first_field as u8, first_step: first_step as u8, whole };
-        // There is room: the count was checked above.
+        // Cannot fail: the count was checked above.
         self.shares.push(share).map_err(|_| PartError::TooManyFrames)
     }
 
-    /// The index of the frame with this id. At least half of the places are empty, so the search is
-    /// short.
+    /// The index of the frame with this id. At least half of the table is empty, so the search is short.
     fn index_of(&self, key: CanKey) -> Option<usize> {
         let first = self.search_order(key).next()?;
         let index = usize::from(*self.places.get(first)?);
         if *self.keys.get(index)? == key { Some(index) } else { self.index_behind(key) }
     }
 
-    /// The same, when there is another frame at its first choice.
+    /// Continues the search if the first slot has another frame.
     fn index_behind(&self, key: CanKey) -> Option<usize> {
         for at in self.search_order(key) {
             let index = usize::from(*self.places.get(at)?);
-            // An empty place is not an index.
+            // [`EMPTY`] is not a valid index.
             if *self.keys.get(index)? == key {
                 return Some(index);
             }
@@ -208,7 +205,7 @@ impl CanLayout {
         None
     }
 
-    /// The places of a key, first choice first.
+    /// Slots of the hash table in which a key may be, in order.
     fn search_order(&self, key: CanKey) -> impl Iterator<Item = usize> + use<> {
         let first = (key.number().wrapping_mul(SPREAD) >> PLACE_SHIFT) as usize;
         (0..PLACES).map(move |further| first.wrapping_add(further) % PLACES)
@@ -221,23 +218,23 @@ impl<'a> CanFrameLayout<'a> {
         self.id
     }
 
-    /// Length of its data in bytes, 1..=8.
+    /// Length of the data in bytes, 1..=8.
     #[allow(clippy::len_without_is_empty, reason = "no frame of a recipe is empty")]
     pub const fn len(&self) -> usize {
         self.share.whole.len()
     }
 
-    /// Its fields in order, each with its place in the data.
+    /// The fields in order, each with its place in the data.
     pub fn fields(&self) -> impl Iterator<Item = PlacedField> + Clone + 'a {
         self.frame_fields().placed()
     }
 
-    /// The data's values, in field order; fewer when the data is too short.
+    /// The data's values, in field order; fewer if the data is too short.
     pub fn values<'b>(&'b self, data: &'b [u8]) -> Values<'b> {
         self.frame_fields().values(data)
     }
 
-    /// Checks that every value of the data may be used (D22).
+    /// Checks that all values of the data are valid (D22).
     ///
     /// # Errors
     /// [`ValueError`]: a float or double that is not finite, or data of another length.
@@ -245,8 +242,8 @@ impl<'a> CanFrameLayout<'a> {
         self.frame_fields().check(data)
     }
 
-    /// Writes the data's values into the process image: all of them, or none. User-defined fields
-    /// have no place in it, so for them this is [`Self::check`].
+    /// Writes the data's values into the process image: all of them, or none. User-defined fields are not in the image;
+    /// for them this is [`Self::check`].
     ///
     /// # Errors
     /// [`ValueError`]: a float that is not finite, or data of another length.
@@ -256,11 +253,11 @@ impl<'a> CanFrameLayout<'a> {
         {
             return Ok(applied);
         }
-        // Not by `self`, which would have to be in memory on the way above.
+        // Does not pass `self`, which would then have to be in memory on the fast path above.
         Self::apply_runs(self.layout, self.index, data, image)
     }
 
-    /// The frame with the image's values. User-defined fields have no place there and are zero.
+    /// Encodes the image's values as a frame. User-defined fields are not in the image and are sent as zero.
     pub fn encode(&self, image: &[u8; IMAGE_BYTES]) -> CanFrame {
         CanFrame::filled(self.id, self.len() as u8, |data| {
             if !self.share.whole.encode(image, data) {
@@ -269,7 +266,7 @@ impl<'a> CanFrameLayout<'a> {
         })
     }
 
-    /// The frame with these values, one per field.
+    /// Encodes these values, one per field, as a frame.
     ///
     /// # Errors
     /// [`EncodeError`]: too few or too many values, or a value of another type.
@@ -302,7 +299,7 @@ impl<'a> CanFrameLayout<'a> {
         data: &[u8],
         image: &mut [u8; IMAGE_BYTES],
     ) -> Result<Applied, ValueError> {
-        // The index is of a frame.
+        // `index` is always valid.
         let Some(frame) = layout.frame(index) else { return Ok(Applied::default()) };
         match frame.runs().apply(data, image) {
             Some(applied) => Ok(applied),
@@ -311,7 +308,7 @@ impl<'a> CanFrameLayout<'a> {
     }
 }
 
-/// The place of the n-th field of the part; fields from `first_field` on belong to the new `frame`.
+/// The place of the n-th field of the part. Fields from `first_field` on belong to the new `frame`.
 fn place_among(finished: &[Share], first_field: usize, frame: u8, nth: usize) -> FieldPlace {
     let begun = finished.iter().take_while(|share| usize::from(share.first_field) <= nth).enumerate().last();
     let (frame, first) = match begun {
@@ -321,13 +318,13 @@ fn place_among(finished: &[Share], first_field: usize, frame: u8, nth: usize) ->
     FieldPlace { frame: Some(frame), field: nth.saturating_sub(first) as u8 }
 }
 
-/// Twice the maximum number of ids, so that the search for a missing one ends soon.
+/// Twice the maximum number of ids, so that a search for an unknown id ends soon.
 const PLACES: usize = 2 * MAX_CAN_IDS;
 const PLACE_SHIFT: u32 = u32::BITS - PLACES.ilog2();
 const _: () = assert!(PLACES.is_power_of_two());
-/// 2^32 divided by the golden ratio: neighbouring ids get places far apart.
+/// 2^32 divided by the golden ratio: spreads neighbouring ids over the table.
 const SPREAD: u32 = 0x9E37_79B1;
-/// No frame has this index.
+/// Not a valid index.
 const EMPTY: u8 = u8::MAX;
 
 impl core::fmt::Display for CanReject {

@@ -1,11 +1,10 @@
-//! Finds frames in a stream of bytes (docs/wire/recipes.md section 4, D19), and checks datagrams
-//! (section 5).
+//! Finds frames in a byte stream (docs/wire/recipes.md section 4, D19), and checks datagrams (section 5).
 //!
-//! In: chunks of any size. Out: the payload of each frame, and counts of everything else. The
-//! caller knows when the line was silent for too long, and calls [`Deframer::discard`].
+//! In: chunks of any size. Out: the payload of each frame, and counts of everything else. The caller knows when the
+//! line was silent for too long and calls [`Deframer::discard`].
 //!
-//! Work is linear in the bytes received, whatever they are: a byte is compared with the up to eight bytes of head
-//! and tail, and copied twice at most, which a test counts.
+//! Work is linear in the bytes received, whatever they are: a byte is compared with the at most eight bytes of head and
+//! of tail and copied at most twice. A test counts this.
 
 use core::ops::Range;
 
@@ -23,18 +22,18 @@ pub struct DeframerStats {
     pub frames: u64,
     /// Bytes dropped because no frame begins there.
     pub skipped_bytes: u64,
-    /// Times that the bytes in the tail's place were not the tail.
+    /// Number of possible frames without the tail at their end.
     pub tail_mismatches: u64,
     /// Bytes of partial frames that [`Deframer::discard`] dropped.
     pub discarded_bytes: u64,
 }
 
-/// Cuts a byte stream into frames.
+/// Splits a byte stream into frames.
 ///
-/// It holds at most one byte less than a frame, and only bytes that may still become a frame.
+/// Holds at most one byte less than a frame, and only bytes that may still become a frame.
 #[derive(Debug, Clone)]
 pub struct Deframer {
-    /// Twice the longest frame: held bytes are moved to the front only when as many were dropped before them.
+    /// Twice the longest frame, so that held bytes are moved to the front only after as many bytes were dropped.
     buffer: [u8; 2 * MAX_STREAM_FRAME],
     start: u16,
     len: u16,
@@ -42,7 +41,7 @@ pub struct Deframer {
 }
 
 impl DeframerStats {
-    /// Whether what has the length of a frame, and begins with its head, is one; counts it.
+    /// Whether `frame`, which has the right length and head, also has the tail; counts the result.
     fn judge(&mut self, layout: &StreamLayout, frame: &[u8]) -> bool {
         count_visits(layout.tail.len());
         let is_frame = layout.tail.ends(frame);
@@ -65,12 +64,12 @@ impl Deframer {
         Self { buffer: [0; _], start: 0, len: 0, stats }
     }
 
-    /// The payload of the next frame. Takes bytes from the front of `chunk`. Call it again with the
-    /// rest until it returns `None`, which means that the chunk is used up.
+    /// The payload of the next frame. Takes bytes from the front of `chunk`. Call it again with the rest until it
+    /// returns `None`: then all of `chunk` is taken.
     ///
-    /// All calls between two [`Self::discard`]s must be given the same layout.
-    // Inline in other crates, with what it calls: a short frame takes a tenth less.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
+    /// All calls between two [`Self::discard`]s must use the same layout.
+    // Inlined into other crates with its callees: a short frame takes 10 % fewer instructions. docs/performance.md
+    // section 1 has the cost of this attribute and the others here.
     #[inline]
     pub fn next_frame<'s, 'c: 's>(
         &'s mut self,
@@ -85,14 +84,14 @@ impl Deframer {
         self.search(layout, chunk)
     }
 
-    /// Takes from the chunk what is missing of the held frame, until it is one, or nothing is held any more, or the
-    /// chunk is used up. Returns where the frame is in the buffer.
+    /// Takes missing bytes of the held frame from the chunk until the frame is complete, nothing is held any more, or
+    /// the chunk is empty. Returns the position of the frame in the buffer.
     #[inline]
     fn complete(&mut self, layout: &StreamLayout, chunk: &mut &[u8]) -> Option<Range<usize>> {
         let frame_len = layout.frame_len();
         while self.pending() > 0 && !chunk.is_empty() {
             let Some(missing @ 1..) = frame_len.checked_sub(self.pending()) else {
-                // The layout was changed without a discard.
+                // The layout changed without a discard.
                 self.discard();
                 break;
             };
@@ -119,7 +118,7 @@ impl Deframer {
         None
     }
 
-    /// Looks for a frame in the chunk itself, with nothing held, and holds the beginning of one at its end.
+    /// Searches a frame in the chunk itself while nothing is held, and holds a beginning of a frame at its end.
     #[inline]
     fn search<'c>(&mut self, layout: &StreamLayout, chunk: &mut &'c [u8]) -> Option<&'c [u8]> {
         while !chunk.is_empty() {
@@ -142,9 +141,9 @@ impl Deframer {
         None
     }
 
-    /// Holds a chunk that neither completes a frame nor shows that none has begun. `false` if [`Self::next_frame`] has
-    /// to look at it; then nothing was taken.
-    // A frame byte by byte through the engine takes 4846 instructions out of line, and 4130 inline.
+    /// Holds a chunk that neither completes a frame nor rules out that one has begun. Returns `false`, with nothing
+    /// taken, if [`Self::next_frame`] has to handle it.
+    // A frame byte by byte through the engine takes 4846 instructions if this is out of line, and 4130 inline.
     #[inline(always)]
     pub(crate) fn hold(&mut self, layout: &StreamLayout, chunk: &[u8]) -> bool {
         let held = self.pending();
@@ -157,7 +156,7 @@ impl Deframer {
         }
         let place = self.end();
         match (chunk, self.buffer.get_mut(place)) {
-            // As many drivers report them.
+            // Many drivers report single bytes.
             ([byte], Some(free)) => {
                 count_visits(1);
                 *free = *byte;
@@ -168,29 +167,28 @@ impl Deframer {
         !chunk.is_empty()
     }
 
-    // Inline, its copy costs each single byte: a frame byte by byte to UDP takes 4984 instructions then, 4130 so.
+    // If inline, its copy slows down single bytes: a frame byte by byte to UDP takes 4984 instead of 4130 instructions.
     #[inline(never)]
     fn push_short(&mut self, bytes: &[u8]) {
         self.push(bytes);
     }
 
-    /// The bytes of a possible frame that are held.
+    /// The held bytes of a possible frame.
     pub fn held(&self) -> &[u8] {
         self.buffer.get(usize::from(self.start)..self.end()).unwrap_or(&[])
     }
 
-    /// Number of held bytes, which may become a frame.
+    /// Number of held bytes of a possible frame.
     pub const fn pending(&self) -> usize {
         self.len as usize
     }
 
-    /// Behind the held bytes.
+    /// End of the held bytes.
     const fn end(&self) -> usize {
         self.start.wrapping_add(self.len) as usize
     }
 
-    /// Drops a partial frame, because the line was silent or the recipe changed, and returns its
-    /// number of bytes.
+    /// Drops a partial frame, because the line was silent or the recipe changed, and returns its number of bytes.
     pub fn discard(&mut self) -> usize {
         let dropped = self.pending();
         self.stats.discarded_bytes = self.stats.discarded_bytes.wrapping_add(dropped as u64);
@@ -198,7 +196,7 @@ impl Deframer {
         dropped
     }
 
-    /// Counters since the deframer was made.
+    /// Counters since the deframer was created.
     pub const fn stats(&self) -> DeframerStats {
         self.stats
     }
@@ -213,7 +211,7 @@ impl Deframer {
         self.stats.skipped_bytes = self.stats.skipped_bytes.wrapping_add(bytes as u64);
     }
 
-    /// Holds bytes, no more than a frame is short of.
+    /// Holds `bytes`, at most the missing bytes of a frame.
     #[inline]
     fn push(&mut self, bytes: &[u8]) {
         count_visits(bytes.len());
@@ -241,7 +239,8 @@ impl Deframer {
     }
 }
 
-/// Where the first bytes are that begin with the head, or may be its beginning; the length if there are none.
+/// Position of the first bytes that match the head, or its beginning at the end of `bytes`; the length if there are
+/// none.
 fn position_of_head(head: &FrameHead, bytes: &[u8]) -> usize {
     let mut at = 0;
     while let Some(rest) = bytes.get(at..)
@@ -252,7 +251,7 @@ fn position_of_head(head: &FrameHead, bytes: &[u8]) -> usize {
     at
 }
 
-/// Whether the bytes begin with the head, or are its beginning.
+/// Whether `bytes` begin with the head, or are the beginning of it.
 fn agrees(head: &FrameHead, bytes: &[u8]) -> bool {
     count_visits(head.len());
     head.agrees(bytes)

@@ -1,29 +1,29 @@
-//! Heads and tails of stream frames. They are compared as one word: byte by byte, that is half the work of decoding a
-//! short frame.
+//! Heads and tails of stream frames. They are compared as one word: comparing byte by byte would be half the work of
+//! decoding a short frame.
 
 use super::model::MAX_DELIMITER;
 use crate::wire::runs;
 
-/// Up to 8 bytes at the front of a frame, zeros behind them.
+/// Up to 8 bytes at the front of a frame, padded with zeros at the end.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameHead {
     word: [u8; MAX_DELIMITER],
-    /// Ones where the head is.
+    /// Ones in the bytes of the head.
     mask: [u8; MAX_DELIMITER],
     len: u8,
 }
 
-/// Up to 8 bytes at the end of a frame, zeros before them.
+/// Up to 8 bytes at the end of a frame, padded with zeros at the front.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameTail {
     word: [u8; MAX_DELIMITER],
-    /// Ones where the tail is.
+    /// Ones in the bytes of the tail.
     mask: [u8; MAX_DELIMITER],
     len: u8,
 }
 
 impl FrameHead {
-    /// `None` when there are more than 8 bytes.
+    /// `None` if there are more than 8 bytes.
     pub(super) fn new(head: &[u8]) -> Option<Self> {
         let (mut word, mut mask) = ([0; MAX_DELIMITER], [0; MAX_DELIMITER]);
         word.get_mut(..head.len())?.copy_from_slice(head);
@@ -39,7 +39,7 @@ impl FrameHead {
         self.len as usize
     }
 
-    /// The head in eight bytes, zeros behind it.
+    /// The head, padded with zeros at the end.
     pub(super) const fn padded(&self) -> [u8; MAX_DELIMITER] {
         self.word
     }
@@ -49,7 +49,7 @@ impl FrameHead {
         let front = match data.first_chunk() {
             Some(front) => *front,
             None => {
-                // Bytes that have not come yet agree.
+                // Bytes that have not arrived count as equal.
                 let mut front = self.word;
                 if let Some(front) = front.get_mut(..data.len()) {
                     runs::copy(front, data);
@@ -62,7 +62,7 @@ impl FrameHead {
 }
 
 impl FrameTail {
-    /// `None` when there are more than 8 bytes.
+    /// `None` if there are more than 8 bytes.
     pub(super) fn new(tail: &[u8]) -> Option<Self> {
         let (mut word, mut mask) = ([0; MAX_DELIMITER], [0; MAX_DELIMITER]);
         let unused = MAX_DELIMITER.checked_sub(tail.len())?;
@@ -79,7 +79,7 @@ impl FrameTail {
         self.len as usize
     }
 
-    /// The tail in eight bytes, zeros before it.
+    /// The tail, padded with zeros at the front.
     pub(super) const fn padded(&self) -> [u8; MAX_DELIMITER] {
         self.word
     }
@@ -89,7 +89,7 @@ impl FrameTail {
         let back = match frame.last_chunk() {
             Some(back) => *back,
             None => {
-                // A frame is not shorter than its tail.
+                // A frame is never shorter than its tail.
                 let mut back = self.word;
                 if let Some(back) = back.get_mut(MAX_DELIMITER.saturating_sub(frame.len())..) {
                     runs::copy(back, frame);
@@ -101,7 +101,7 @@ impl FrameTail {
     }
 }
 
-/// Whether two words are the same where the mask has ones.
+/// Whether two words are equal in the bits of the mask.
 fn agree(a: [u8; MAX_DELIMITER], b: [u8; MAX_DELIMITER], mask: [u8; MAX_DELIMITER]) -> bool {
     (u64::from_ne_bytes(a) ^ u64::from_ne_bytes(b)) & u64::from_ne_bytes(mask) == 0
 }

@@ -1,4 +1,4 @@
-//! What can be wrong with a recipe part, a payload or a buffer; every error carries its numbers.
+//! Errors in a recipe part, a payload or a buffer; each one carries its numbers.
 
 use core::fmt;
 
@@ -13,7 +13,7 @@ use crate::wire::scalar::ScalarType;
 pub struct FieldPlace {
     /// The frame of a CAN part; `None` in a stream part.
     pub frame: Option<u8>,
-    /// The field in the stream part or in that frame.
+    /// Index of the field in the stream part or in the CAN frame.
     pub field: u8,
 }
 
@@ -42,7 +42,7 @@ pub enum PartError {
         /// Its length in bytes.
         len: usize,
     },
-    /// A part for a byte stream without head and tail: frames could not be found in it.
+    /// A part for a byte stream that has neither head nor tail, so its frames could not be found.
     NoDelimiter,
     /// Head, fields and tail together are longer than [`MAX_STREAM_FRAME`].
     StreamFrameTooLong {
@@ -94,7 +94,7 @@ pub enum PartError {
         /// Its id.
         id: CanId,
     },
-    /// Two frames of a device with one id, and no constant that tells them apart.
+    /// Two frames of a device with the same id, and no constant to tell them apart.
     Indistinguishable {
         /// The second of the two.
         frame: u8,
@@ -103,7 +103,7 @@ pub enum PartError {
         /// Their id.
         id: CanId,
     },
-    /// Two frames of a CAN part with one id.
+    /// Two frames of a CAN part with the same id.
     DuplicateId {
         /// The second of the two.
         frame: u8,
@@ -115,7 +115,7 @@ pub enum PartError {
 }
 
 impl PartError {
-    /// The field that the error concerns, if there is one.
+    /// The field that the error concerns.
     pub const fn field(&self) -> Option<FieldPlace> {
         match *self {
             Self::TooManyFields { at }
@@ -126,7 +126,7 @@ impl PartError {
         }
     }
 
-    /// The frame of a CAN part that the error concerns, if there is one.
+    /// The frame of a CAN part that the error concerns.
     pub const fn frame(&self) -> Option<u8> {
         match *self {
             Self::NoFields { frame } => frame,
@@ -144,7 +144,7 @@ impl PartError {
 }
 
 impl fmt::Display for FieldPlace {
-    /// Messages count from 1.
+    /// Messages count frames and fields from 1.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let field = u16::from(self.field).saturating_add(1);
         match self.frame {
@@ -230,7 +230,7 @@ pub enum ValueError {
         /// The first such field, counted from 0.
         field: u8,
     },
-    /// The payload is not as long as the fields.
+    /// The length of the payload is not that of the fields.
     Length {
         /// The fields' length in bytes.
         expected: usize,
@@ -270,21 +270,21 @@ impl fmt::Display for NoSpace {
 
 impl core::error::Error for NoSpace {}
 
-/// Why values do not make a frame; nothing was written.
+/// Why a frame cannot be encoded from values; nothing was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum EncodeError {
     /// The buffer is too short.
     NoSpace(NoSpace),
-    /// The number of values is not the number of fields.
+    /// The number of values differs from the number of fields.
     Count {
         /// Number of fields.
         expected: usize,
         /// Number of values.
         got: usize,
     },
-    /// A value does not have its field's type.
+    /// The type of a value differs from its field's.
     Type {
         /// The field, counted from 0.
         field: u8,
@@ -324,16 +324,16 @@ impl core::error::Error for EncodeError {}
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum DatagramError {
-    /// It is not as long as a frame.
+    /// The length is wrong.
     Length {
         /// The frame's length in bytes.
         expected: usize,
         /// The datagram's length.
         got: usize,
     },
-    /// It does not begin with the head.
+    /// The head is wrong.
     Head,
-    /// It does not end with the tail.
+    /// The tail is wrong.
     Tail,
 }
 

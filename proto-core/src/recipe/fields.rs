@@ -1,5 +1,5 @@
-//! The fields of a part or of one CAN frame: checked one by one, then moved between payload and
-//! process image in merged runs (docs/wire/recipes.md sections 2 and 7).
+//! The fields of a part or of one CAN frame: checked one by one, then moved between payload and process image in merged
+//! runs (docs/wire/recipes.md sections 2 and 7).
 
 use heapless::Vec;
 
@@ -12,7 +12,7 @@ use crate::wire::scalar::{Scalar, ScalarType};
 /// One field and its place in the payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PlacedField {
-    /// Offset of its first byte, counted from the payload's.
+    /// Offset of its first byte in the payload.
     pub offset: usize,
     /// The field.
     pub field: Field,
@@ -22,7 +22,7 @@ pub struct PlacedField {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Applied {
-    /// Fields whose reserved bits were set; they were cleared on the way into the image.
+    /// Number of fields with reserved bits set; the bits were cleared in the image.
     pub masked: u16,
 }
 
@@ -48,15 +48,15 @@ impl Iterator for Values<'_> {
     }
 }
 
-/// All fields of a part with the runs that move them.
+/// All fields of a part, and the runs that copy them.
 #[derive(Debug, Clone)]
 pub(super) struct Pool {
     fields: Vec<Field, MAX_FIELDS>,
     steps: Vec<FieldRun, MAX_FIELDS>,
 }
 
-/// At most [`runs::MAX_RUN`] payload bytes that are neighbours in the image too. The runs of a
-/// frame cover its payload in order, without gaps.
+/// At most [`runs::MAX_RUN`] bytes that are adjacent in the payload and in the image. The runs of a frame cover its
+/// payload in order, without gaps.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FieldRun {
     image: u16,
@@ -64,35 +64,35 @@ pub(super) struct FieldRun {
     kind: RunContent,
 }
 
-/// The content of a run: the bits that are not reserved if it is one byte with reserved bits, else
-/// [`RunContent::FLOATS`] or [`RunContent::PLAIN`]. One byte, because parts have up to 128 runs.
+/// The content of a run: for one byte with reserved bits the mask of its other bits, else [`RunContent::FLOATS`] or
+/// [`RunContent::PLAIN`]. It takes one byte, because parts have up to 128 runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct RunContent(u8);
 
 impl RunContent {
     /// Floats, which must be finite.
     const FLOATS: Self = Self(0);
-    /// Anything that is valid whatever its bits are.
+    /// Every bit pattern is valid.
     const PLAIN: Self = Self(0xFF);
 }
 
-/// One frame's fields.
+/// The fields of one frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameFields<'a> {
     fields: &'a [Field],
-    /// Bytes of the payload.
+    /// Length of the payload in bytes.
     len: usize,
 }
 
-/// One frame's runs, of which there are several, or none if its fields are user-defined.
+/// The runs of one frame: several, or none if its fields are user-defined.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Runs<'a> {
     steps: &'a [FieldRun],
-    /// Bytes of the payload.
+    /// Length of the payload in bytes.
     len: usize,
 }
 
-/// Where the fields and runs of a frame begin in a [`Pool`]. They end where those of the next frame begin.
+/// Where the fields and runs of a frame begin in a [`Pool`]; they end where those of the next frame begin.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
     pub(super) first_field: u8,
@@ -113,9 +113,8 @@ impl Pool {
         self.steps.len()
     }
 
-    /// Adds a field after the existing ones. `frame_starts` is the step count at the beginning of
-    /// its frame, so that runs never reach across frames; `place_of` gives the place of the n-th
-    /// field of the pool.
+    /// Appends a field. `frame_starts` is the number of runs at the beginning of its frame, so that runs are not merged
+    /// across frames; `place_of` returns the place of the n-th field of the pool.
     pub(super) fn push(
         &mut self,
         rules: Rules,
@@ -142,14 +141,14 @@ impl Pool {
         let Some(step) = step else { return Ok(()) };
         match self.steps.get_mut(frame_starts..).and_then(|steps| steps.last_mut()) {
             Some(last) if last.joins(step) => last.len = last.len.saturating_add(step.len),
-            // There are never more runs than fields, so the push cannot fail.
+            // Cannot fail: there are never more runs than fields.
             _ => self.steps.push(step).map_err(|_| PartError::TooManyFields { at })?,
         }
         Ok(())
     }
 
-    /// A frame of `len` bytes as one run: all of what was added since `first_step` was the next one. Most parts are;
-    /// else the run is nowhere in the image.
+    /// The single run of a frame of `len` bytes, which is all that was added since `first_step`. Most parts consist of
+    /// one run; for others, the result has no place in the image.
     pub(super) fn whole(&self, first_step: usize, len: usize) -> FieldRun {
         match self.steps.get(first_step..) {
             Some([step]) => *step,
@@ -161,12 +160,12 @@ impl Pool {
         }
     }
 
-    /// The fields from `first` to before `end`, of a frame of `len` bytes.
+    /// The fields `first..end`, of a frame of `len` bytes.
     pub(super) fn fields(&self, first: usize, end: usize, len: usize) -> FrameFields<'_> {
         FrameFields { fields: self.fields.get(first..end).unwrap_or(&[]), len }
     }
 
-    /// The runs from `first` to before `end`, of a frame of `len` bytes.
+    /// The runs `first..end`, of a frame of `len` bytes.
     pub(super) fn runs(&self, first: usize, end: usize, len: usize) -> Runs<'_> {
         Runs { steps: self.steps.get(first..end).unwrap_or(&[]), len }
     }
@@ -191,9 +190,9 @@ impl FieldRun {
 }
 
 impl Runs<'_> {
-    /// Writes a payload into the image; `None`, with nothing written, if [`FrameFields::check`] has
-    /// to look closer.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
+    /// Writes a payload into the image. Returns `None`, with nothing written, if [`FrameFields::check`] has to handle
+    /// it.
+    // docs/performance.md section 1 has the cost of this attribute and the others here.
     #[inline(never)]
     pub(super) fn apply(self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
         if payload.len() != self.len {
@@ -219,7 +218,7 @@ impl Runs<'_> {
         Some(applied)
     }
 
-    /// Fills a payload from the image; user-defined fields have no place there and become zero.
+    /// Fills a payload from the image; user-defined fields are not in the image and become zero.
     pub(super) fn encode(self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) {
         let mut rest = payload;
         for step in self.steps {
@@ -249,7 +248,7 @@ impl<'a> FrameFields<'a> {
         Values { fields: self.fields.iter(), payload }
     }
 
-    /// Refuses a payload of another length, or with a float or double that is not finite.
+    /// Rejects a payload of another length, or with a float or double that is not finite.
     pub(super) fn check(self, payload: &[u8]) -> Result<(), ValueError> {
         if payload.len() != self.len {
             return Err(ValueError::Length { expected: self.len, got: payload.len() });
@@ -260,7 +259,7 @@ impl<'a> FrameFields<'a> {
         }
     }
 
-    /// Whether there is one value per field, each of its field's type.
+    /// Checks that there is one value per field, each of its field's type.
     pub(super) fn accepts(self, values: &[Scalar]) -> Result<(), EncodeError> {
         if values.len() != self.fields.len() {
             return Err(EncodeError::Count { expected: self.fields.len(), got: values.len() });
@@ -272,7 +271,7 @@ impl<'a> FrameFields<'a> {
         }
     }
 
-    /// Fills a payload with values that [`Self::accepts`] accepted.
+    /// Fills a payload with values that passed [`Self::accepts`].
     pub(super) fn encode_values(self, values: &[Scalar], payload: &mut [u8]) {
         let mut rest = payload;
         for value in values {
@@ -284,13 +283,12 @@ impl<'a> FrameFields<'a> {
 }
 
 impl FieldRun {
-    /// Bytes of the payload.
     pub(super) const fn len(&self) -> usize {
         self.len as usize
     }
 
-    /// Writes a payload that is one run, and as long as it, into the image; `None`, with nothing written, if
-    /// [`Runs::apply`] or [`FrameFields::check`] has to look closer.
+    /// Writes a payload that is this one run, and has its length, into the image. Returns `None`, with nothing written,
+    /// if [`Runs::apply`] or [`FrameFields::check`] has to handle it.
     #[inline(always)]
     pub(super) fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Option<Applied> {
         let start = usize::from(self.image);
@@ -301,7 +299,8 @@ impl FieldRun {
         Some(Applied { masked: self.put(payload, target) })
     }
 
-    /// Fills a payload that is one run from the image; `false`, with nothing written, if it is none.
+    /// Fills a payload that is this one run from the image; `false`, with nothing written, if the frame has several
+    /// runs.
     pub(super) fn encode(&self, image: &[u8; IMAGE_BYTES], payload: &mut [u8]) -> bool {
         match image.get(self.range()) {
             Some(source) if payload.len() == source.len() => {
@@ -312,13 +311,12 @@ impl FieldRun {
         }
     }
 
-    /// Whether the values of a run may be used.
+    /// Whether the values are valid.
     fn accepts(&self, run: &[u8]) -> bool {
         self.kind != RunContent::FLOATS || runs::all_finite(run)
     }
 
-    /// Writes a run to its place in the image, and returns how many of its fields had reserved bits
-    /// set.
+    /// Writes a run into the image, and returns the number of fields that had reserved bits set.
     fn write(&self, run: &[u8], image: &mut [u8; IMAGE_BYTES]) -> u16 {
         image.get_mut(self.range()).map_or(0, |target| self.put(run, target))
     }
@@ -337,7 +335,7 @@ impl FieldRun {
         }
     }
 
-    /// Reads a run from its place in the image.
+    /// Reads a run from the image.
     fn read(&self, image: &[u8; IMAGE_BYTES], run: &mut [u8]) {
         if let Some(source) = image.get(self.range()) {
             runs::copy(run, source);
@@ -350,6 +348,6 @@ impl FieldRun {
     }
 }
 
-/// No run is so far behind in the image.
+/// Beyond the end of the image.
 const NOWHERE: u16 = u16::MAX;
 const _: () = assert!(IMAGE_BYTES < NOWHERE as usize);

@@ -1,13 +1,10 @@
-//! Recipes: frames of chosen variables in byte streams, datagrams and CAN frames
-//! (docs/wire/recipes.md).
+//! Recipes: frames of chosen variables in byte streams, datagrams and CAN frames (docs/wire/recipes.md).
 //!
-//! In: a recipe part as configured, then received bytes or CAN frames. Out: checked values in the
-//! process image, typed values for user-defined recipes, and encoded frames the other way. Knows
-//! nothing of ports, time or who owns a variable.
+//! In: a recipe part as configured, then received bytes or CAN frames. Out: checked values in the process image, typed
+//! values for user-defined recipes, and encoded frames. Does not know ports, time or the owners of variables.
 //!
-//! A part is checked and compiled once ([`StreamLayout::new`], [`CanLayout::new`]); after that no
-//! function here can fail on anything but the received bytes themselves or a buffer that is too
-//! short, and none can panic.
+//! A part is checked and compiled once ([`StreamLayout::new`], [`CanLayout::new`]). After that, functions here fail
+//! only because of received bytes or a buffer that is too short; none can panic.
 
 mod can;
 mod deframer;

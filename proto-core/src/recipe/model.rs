@@ -1,4 +1,4 @@
-//! What a recipe is made of, and its limits (docs/wire/recipes.md section 2, D16, D18).
+//! The parts of a recipe, and their limits (docs/wire/recipes.md section 2, D16, D18).
 
 use crate::sysvar::{Direction, SysVar};
 use crate::wire::scalar::ScalarType;
@@ -12,18 +12,18 @@ pub const MAX_STREAM_FRAME: usize = 512;
 /// Most frame ids of one CAN part.
 pub const MAX_CAN_IDS: usize = 32;
 
-/// What kind of fields a recipe has.
+/// The kind of a recipe's fields.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Mode {
-    /// System variables, sent and applied by the system itself, every cycle.
+    /// System variables, sent and applied by the system in every cycle.
     Realtime,
-    /// Fields that the user names; a program (or the gateway's bindings) moves their values.
+    /// Fields named by the user; a program, or the gateway's bindings, moves their values.
     User,
 }
 
-/// What a part's fields must be.
+/// What fields a part may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Rules {
@@ -53,11 +53,11 @@ impl Field {
     }
 }
 
-/// Whether frames must be found in a stream of bytes, or arrive one in each datagram (D18).
+/// Whether frames are searched in a byte stream, or arrive one per datagram (D18).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Framing {
-    /// RS-485 and TCP: a head or a tail is needed.
+    /// RS-485 and TCP: a head or a tail is required.
     Bytes,
     /// UDP: one datagram is one frame; head and tail may both be empty.
     Datagram,

@@ -24,7 +24,7 @@ pub struct StreamLayout {
 }
 
 impl StreamLayout {
-    /// Checks a part and compiles it.
+    /// Checks and compiles a part.
     ///
     /// # Errors
     /// [`PartError`] says which limit or rule is broken, and by which field.
@@ -65,12 +65,12 @@ impl StreamLayout {
         self.rules
     }
 
-    /// Bytes of a whole frame: head, fields and tail; at most 512.
+    /// Length of a whole frame in bytes: head, fields and tail; at most 512.
     pub const fn frame_len(&self) -> usize {
         self.frame_len as usize
     }
 
-    /// Bytes of the fields.
+    /// Length of the fields in bytes.
     pub const fn payload_len(&self) -> usize {
         self.payload_len as usize
     }
@@ -90,12 +90,12 @@ impl StreamLayout {
         self.all_fields().placed()
     }
 
-    /// The payload's values, in field order; fewer when the payload is too short.
+    /// The payload's values, in field order; fewer if the payload is too short.
     pub fn values<'a>(&'a self, payload: &'a [u8]) -> Values<'a> {
         self.all_fields().values(payload)
     }
 
-    /// Whether every value of the payload may be used (D22).
+    /// Checks that all values of the payload are valid (D22).
     ///
     /// # Errors
     /// [`ValueError`]: a float or double that is not finite, or a payload of another length.
@@ -103,15 +103,16 @@ impl StreamLayout {
         self.all_fields().check(payload)
     }
 
-    /// Writes the payload's values into the process image: all of them, or none. User-defined
-    /// fields have no place in it, so for them this is [`Self::check`].
+    /// Writes the payload's values into the process image: all of them, or none. User-defined fields are not in the
+    /// image; for them this is [`Self::check`].
     ///
     /// # Errors
     /// [`ValueError`]: a float that is not finite, or a payload of another length.
-    // Its cost is in docs/performance.md section 1, as that of the other attributes here.
+    // docs/performance.md section 1 has the cost of this attribute and the others here.
     #[inline]
     pub fn apply(&self, payload: &[u8], image: &mut [u8; IMAGE_BYTES]) -> Result<Applied, ValueError> {
-        // Not with the run's length: that a payload of a frame is as long as this one the compiler knows.
+        // Compared with `payload_len`, not with the run's length: the compiler knows that a frame's payload has this
+        // length.
         if payload.len() == self.payload_len()
             && let Some(applied) = self.whole.apply(payload, image)
         {
@@ -120,11 +121,11 @@ impl StreamLayout {
         self.apply_runs(payload, image)
     }
 
-    /// Writes a frame with the image's values to the front of `out` and returns its length.
-    /// User-defined fields have no place in the image and are sent as zero.
+    /// Writes a frame with the image's values to the front of `out` and returns its length. User-defined fields are not
+    /// in the image and are sent as zero.
     ///
     /// # Errors
-    /// [`NoSpace`], with nothing written, when `out` is shorter than a frame.
+    /// [`NoSpace`], with nothing written, if `out` is shorter than a frame.
     pub fn encode(&self, image: &[u8; IMAGE_BYTES], out: &mut [u8]) -> Result<usize, NoSpace> {
         let payload = self.delimited(out)?;
         if !self.whole.encode(image, payload) {
@@ -133,12 +134,10 @@ impl StreamLayout {
         Ok(self.frame_len())
     }
 
-    /// Writes a frame with these values, one a field, to the front of `out` and returns its
-    /// length.
+    /// Writes a frame with these values, one per field, to the front of `out` and returns its length.
     ///
     /// # Errors
-    /// [`EncodeError`], with nothing written: too few or too many values, a value of another type,
-    /// or not enough space.
+    /// [`EncodeError`], with nothing written: too few or too many values, a value of another type, or not enough space.
     pub fn encode_values(&self, values: &[Scalar], out: &mut [u8]) -> Result<usize, EncodeError> {
         let fields = self.all_fields();
         fields.accepts(values)?;
@@ -162,18 +161,18 @@ impl StreamLayout {
         }
     }
 
-    /// The fields' bytes of a whole frame; `None` only if it is shorter than one.
+    /// The payload of a whole frame; `None` only if `frame` is too short.
     pub(super) fn payload_of<'f>(&self, frame: &'f [u8]) -> Option<&'f [u8]> {
         frame.get(self.head.len()..)?.get(..self.payload_len())
     }
 
-    /// Writes head and tail; the payload's place is returned and must be filled.
+    /// Writes head and tail, and returns the space for the payload, which must be filled.
     fn delimited<'o>(&self, out: &'o mut [u8]) -> Result<&'o mut [u8], NoSpace> {
         let no_space = NoSpace { needed: self.frame_len(), available: out.len() };
         let frame = out.get_mut(..self.frame_len()).ok_or(no_space)?;
         let start = self.head.len();
         if frame.len() >= 2 * MAX_DELIMITER {
-            // Whole words, whose unused bytes fall into the payload.
+            // Writes whole words; their padding falls into the payload.
             if let Some(front) = frame.first_chunk_mut() {
                 *front = self.head.padded();
             }

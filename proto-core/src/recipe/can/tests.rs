@@ -151,7 +151,7 @@ fn can_frames_refuse_what_no_bus_carries() {
 
 #[test]
 fn each_frame_moves_its_own_variables_only() {
-    // The two pairs are neighbours in the image, which must not join their runs.
+    // The two pairs are neighbours in the image, but their runs must not be merged.
     let frames = [(id(2), system("RobotState[8..9]")), (id(3), system("RobotState[10..11]"))];
     let layout = CanLayout::new(REALTIME_OUT, frames).unwrap();
     let mut image = [0; IMAGE_BYTES];

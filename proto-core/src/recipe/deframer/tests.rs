@@ -15,13 +15,13 @@ std::thread_local! {
     static VISITS: Cell<usize> = const { Cell::new(0) };
 }
 
-/// Counts looks at received bytes, and copies of them.
+/// Counts comparisons and copies of received bytes.
 pub(super) fn count_visits(bytes: usize) {
     VISITS.set(VISITS.get() + bytes);
 }
 
-/// Visits that one received byte may cost: compared with eight bytes of heads and eight of tails,
-/// and copied twice, all of it twice: once quickly and, where that was not enough, once carefully.
+/// Maximum number of visits per received byte: compared with eight bytes of head and eight of tail, and copied twice;
+/// all of this on the fast path and again on the slow path.
 const VISITS_PER_BYTE: usize = 2 * (8 + 8 + 2);
 
 fn user_layout(head: &[u8], tail: &[u8], types: &[ScalarType]) -> StreamLayout {
@@ -54,7 +54,7 @@ fn sensor_payload(number: u8) -> Vec<u8> {
     sensor_frame(number)[2..26].to_vec()
 }
 
-/// Gives one chunk to the deframer and returns the payloads in it.
+/// Passes one chunk to the deframer and returns the payloads in it.
 fn feed(deframer: &mut Deframer, layout: &StreamLayout, mut chunk: &[u8]) -> Vec<Vec<u8>> {
     let mut payloads = Vec::new();
     while let Some(payload) = deframer.next_frame(layout, &mut chunk) {
@@ -65,16 +65,15 @@ fn feed(deframer: &mut Deframer, layout: &StreamLayout, mut chunk: &[u8]) -> Vec
     payloads
 }
 
-/// The same as the engine does it: what nothing can come of is only held.
+/// Like [`feed`], but tries [`Deframer::hold`] first, as the engine does.
 fn hold_or_feed(deframer: &mut Deframer, layout: &StreamLayout, chunk: &[u8]) -> Vec<Vec<u8>> {
     let is_held = deframer.hold(layout, chunk);
     if is_held { Vec::new() } else { feed(deframer, layout, chunk) }
 }
 
-/// Gives a chunk to a deframer and returns the payloads in it.
+/// A way to pass a chunk to a deframer; returns the payloads in it.
 type Way = fn(&mut Deframer, &StreamLayout, &[u8]) -> Vec<Vec<u8>>;
 
-/// Both of them.
 const WAYS: [Way; 2] = [feed, hold_or_feed];
 
 fn feed_all<'a>(
@@ -85,7 +84,7 @@ fn feed_all<'a>(
     chunks.into_iter().flat_map(|chunk| feed(deframer, layout, chunk)).collect()
 }
 
-/// D19 read literally: a list of bytes whose first is dropped whenever it cannot begin a frame.
+/// D19 taken literally: a list of bytes whose first one is dropped if it cannot begin a frame.
 #[derive(Default)]
 struct Reference {
     bytes: Vec<u8>,
@@ -147,7 +146,7 @@ fn a_frame_cut_at_every_byte_still_arrives_once() {
 
 #[test]
 fn a_frame_that_lost_its_end_hides_no_other() {
-    // The next frame begins inside what would have been the broken one.
+    // The next frame begins inside the expected length of the cut one.
     let layout = sensor();
     for kept in 0..28 {
         let bytes = [&sensor_frame(1)[..kept], &sensor_frame(2), &sensor_frame(3)].concat();
@@ -205,7 +204,7 @@ fn a_head_that_repeats_itself_is_found_after_its_own_beginning() {
     }
 }
 
-/// Gives a line to a deframer and to the reference, in chunks of every size.
+/// Passes a line to a deframer and to the reference, in chunks of every size.
 #[track_caller]
 fn is_read_as_the_reference_reads_it(layout: &StreamLayout, line: &[u8]) {
     for (size, way) in (1..=line.len()).flat_map(|size| WAYS.map(|way| (size, way))) {
@@ -245,7 +244,7 @@ fn silence_discards_a_partial_frame() {
     let expected = DeframerStats { frames: 1, discarded_bytes: 13, ..Default::default() };
     assert_eq!(deframer.stats(), expected);
 
-    // Also its head is forgotten: what ends like a frame does not become one.
+    // The head is dropped too: bytes like the end of a frame do not complete one.
     feed(&mut deframer, &layout, &sensor_frame(3)[..13]);
     deframer.discard();
     let mut headless = sensor_frame(4);
@@ -269,8 +268,8 @@ fn the_deframer_is_not_much_larger_than_two_frames() {
     assert!(size_of::<Deframer>() <= 2 * MAX_STREAM_FRAME + 40, "{}", size_of::<Deframer>());
 }
 
-/// Feeds `line` in chunks of every interesting size, compares with the reference, and returns the
-/// most visits a byte cost.
+/// Passes `line` in chunks of every interesting size, compares with the reference, and returns the maximum number of
+/// visits per byte.
 #[track_caller]
 fn visits_per_byte(layout: &StreamLayout, line: &[u8]) -> usize {
     let mut worst = 0;
@@ -288,12 +287,12 @@ fn the_worst_input_costs_a_bounded_number_of_visits_a_byte() {
     const LINE: usize = 20_000;
     let ones = vec![0xFF; LINE];
     for payload in [1, 24, 300, 496] {
-        // Every byte begins a head, and every frame's tail is wrong in its last byte.
+        // Every byte begins a head, and the tail of every frame is wrong in its last byte.
         let mut tail = [0xFF; 8];
         tail[7] = 0xFE;
         let worst = visits_per_byte(&layout(&[0xFF; 8], &tail, payload), &ones);
         assert!(worst <= VISITS_PER_BYTE, "{worst} visits a byte with {payload} bytes of payload");
-        // Every head breaks in its last byte.
+        // Every head fails at its last byte.
         let worst = visits_per_byte(&layout(&tail, &tail, payload), &ones);
         assert!(worst <= VISITS_PER_BYTE, "{worst} visits a byte with {payload} bytes of payload");
         // No head at all.
@@ -334,7 +333,7 @@ fn a_datagram_is_exactly_one_frame() {
     assert_eq!(datagram(&bare, &[1, 2]), Ok(&[1, 2][..]));
 }
 
-/// A recipe; heads and tails are made of few different bytes, so that they overlap often.
+/// A recipe; heads and tails consist of few different bytes, so that they often overlap.
 fn any_layout() -> impl Strategy<Value = StreamLayout> {
     let delimiter = || many(prop_oneof![4 => Just(0xFF_u8), 2 => Just(0xFE), 1 => any::<u8>()], 0..=8);
     let fields = prop_oneof![8 => many(0..8_usize, 1..12), 1 => many(0..8_usize, 100..=128)];
@@ -348,12 +347,12 @@ fn any_layout() -> impl Strategy<Value = StreamLayout> {
     )
 }
 
-/// What the line carries next.
+/// The next bytes on the line.
 #[derive(Debug, Clone)]
 enum Event {
-    /// A frame whose values are made of these bytes, over and over.
+    /// A frame whose values consist of these bytes, repeated.
     Frame(Vec<u8>),
-    /// A frame of which only the front arrives, a number of 256ths.
+    /// A frame of which only a part arrives, in 256ths.
     Cut(Vec<u8>, u8),
     /// A frame with one byte changed.
     Changed(Vec<u8>, u16, u8),
@@ -371,7 +370,7 @@ fn any_event() -> impl Strategy<Value = Event> {
     ]
 }
 
-/// Encodes a frame from values that these bytes mean.
+/// Encodes a frame whose values consist of these bytes.
 fn encode(layout: &StreamLayout, bytes: &[u8]) -> Vec<u8> {
     let mut source = bytes.iter().copied().cycle();
     let values: Vec<Scalar> = layout
@@ -386,7 +385,7 @@ fn encode(layout: &StreamLayout, bytes: &[u8]) -> Vec<u8> {
     assert_eq!(out.split_off(layout.frame_len()), [0xA5; 3], "nothing past the frame is written");
     let start = layout.head().len();
     let payload = &out[start..start + layout.payload_len()];
-    // NaNs are not equal to themselves, their text is.
+    // Compared as text, because a NaN is not equal to itself.
     let (left, right): (Vec<_>, Vec<_>) = (
         layout.values(payload).map(|v| std::format!("{v:?}")).collect(),
         values.iter().map(|v| std::format!("{v:?}")).collect(),

@@ -180,7 +180,7 @@ fn long_runs_of_neighbours_are_moved_whole() {
     for (direction, first) in
         [(Direction::Input, "DigitalOutputCommand[1]"), (Direction::Output, "RobotState[1]")]
     {
-        // As many neighbours as a part can have, bits, words and floats.
+        // The longest sequences of adjacent bits, words and floats in a part.
         let start = var(first).ordinal();
         let vars = (start..).map_while(SysVar::from_ordinal).take(MAX_FIELDS);
         let vars: Vec<SysVar> = vars.filter(|var| var.direction() == direction).collect();
@@ -189,7 +189,7 @@ fn long_runs_of_neighbours_are_moved_whole() {
         let layout = layout.unwrap();
         let place = vars[0].image_offset()..vars[0].image_offset() + layout.payload_len();
         let mut image = [0; IMAGE_BYTES];
-        // Bytes below 0x3F make no special float.
+        // Bytes below 0x3F never form a float that is not finite.
         for (at, byte) in image[place.clone()].iter_mut().enumerate() {
             *byte = (at % 0x3F) as u8;
         }
@@ -272,7 +272,7 @@ proptest! {
         let fields = vars.iter().map(|&var| Field::System(var));
         let layout = StreamLayout::new(rules, &head, &tail, fields, Framing::Bytes).unwrap();
 
-        // A source whose values may all be received: finite floats, no reserved bits.
+        // A source with valid values only: finite floats, no reserved bits.
         let mut source: [u8; IMAGE_BYTES] = noise.try_into().unwrap();
         for var in SysVar::all() {
             let at = var.image_offset();
