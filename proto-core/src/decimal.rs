@@ -1,6 +1,6 @@
-//! Numbers in the texts of errors, as `{}` of `core` writes them: with as few digits as are read as the same number,
-//! and without an exponent. `core`'s own way has tables and panics, and takes 10 KB of a board's flash; this one is
-//! slow and short.
+//! Formats numbers in error texts like `{}` of `core`: with the fewest digits that parse as the same number, and
+//! without an exponent. `core`'s implementation has tables and panics and takes 10 KB of a board's flash; this one is
+//! small and slow.
 //!
 //! In: a number. Out: its text. The algorithm is the free-format one of Steele and White, "How to Print Floating-Point
 //! Numbers Accurately" (1990), with integers of up to 1152 bits.
@@ -8,12 +8,10 @@
 use core::cmp::Ordering;
 use core::fmt::{self, Write};
 
-/// A number that displays as it would of itself.
+/// A number whose `Display` gives the same text as that of `core`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Decimal {
-    /// Of 32 bits.
     Single(f32),
-    /// Of 64 bits.
     Double(f64),
 }
 
@@ -26,7 +24,7 @@ struct BinaryFloat {
 }
 
 impl BinaryFloat {
-    /// Of the bits without the sign, in a format with so many bits of the mantissa and of the exponent.
+    /// Decodes `bits`, which have no sign, in a format with these numbers of mantissa and exponent bits.
     fn of(bits: u64, mantissa_bits: u32, exponent_bits: u32) -> Self {
         let implied = 1_u64 << mantissa_bits;
         let fraction = bits & implied.wrapping_sub(1);
@@ -63,17 +61,17 @@ impl fmt::Display for Decimal {
     }
 }
 
-/// Writes the digits, with zeros or a point where they have to be.
+/// Writes the digits, with zeros or a point where needed.
 fn write_shortest(parts: &BinaryFloat, out: &mut impl Write) -> fmt::Result {
     let is_even = parts.mantissa & 1 == 0;
-    // All are numerators over `unit`: the number, and half of the way to its neighbours.
+    // All are numerators over `unit`: the number, and half the distances to its neighbours.
     let shift = parts.exponent.max(0) as u32;
     let extra = u32::from(parts.is_closer_below);
     let mut rest = Big::of(parts.mantissa, shift.wrapping_add(1).wrapping_add(extra));
     let mut below = Big::of(1, shift);
     let mut above = Big::of(1, shift.wrapping_add(extra));
     let mut unit = Big::of(1, parts.exponent.min(0).unsigned_abs().wrapping_add(1).wrapping_add(extra));
-    // The number of digits before the point; zeros behind it, if it is below zero.
+    // Number of digits before the point; if negative, the number of zeros after it.
     let mut before = 0_i32;
     while reaches(&rest, &above, &unit, is_even) {
         unit.times_ten();
@@ -108,14 +106,14 @@ fn write_shortest(parts: &BinaryFloat, out: &mut impl Write) -> fmt::Result {
             }
             continue;
         }
-        // The last digit: the nearer one of those that will do, and of two the upper one.
+        // The nearer of the last digits that are possible; the upper one in a tie.
         let is_up = is_high_enough && (!is_low_enough || rest.doubled().cmp(&unit) != Ordering::Less);
         out.write_char(digit.wrapping_add(is_up.into()).into())?;
         return (1..before).try_for_each(|_| out.write_char('0'));
     }
 }
 
-/// Whether `number + more` is at least one; more than one, if not `is_even`.
+/// Whether `number + more` is at least one, or, if not `is_even`, more than one.
 fn reaches(number: &Big, more: &Big, unit: &Big, is_even: bool) -> bool {
     match number.plus(more).cmp(unit) {
         Ordering::Less => false,
@@ -134,10 +132,10 @@ fn reaches_in_tenths(number: &Big, more: &Big, unit: &Big, is_even: bool) -> boo
     }
 }
 
-/// Long enough for the smallest and the largest number of 64 bits, twice, in tenths.
+/// Enough for twice the smallest and the largest 64-bit number, in tenths.
 const WORDS: usize = 36;
 
-/// An integer of 32 bits times [`WORDS`], the lowest word first.
+/// An integer of 32 × [`WORDS`] bits, lowest word first.
 #[derive(Clone, Copy)]
 struct Big([u32; WORDS]);
 
@@ -177,7 +175,7 @@ impl Big {
         self.plus(self)
     }
 
-    /// What is subtracted must not be larger.
+    /// `other` must not be larger.
     fn subtract(&mut self, other: &Self) {
         let mut is_borrowed = false;
         for (word, less) in self.0.iter_mut().zip(&other.0) {

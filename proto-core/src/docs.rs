@@ -1,8 +1,8 @@
-//! The pages on formats and rules that comments cite, such as `docs/wire/recipes.md section 4`: the
-//! same files as in the folder `docs/` of the package. They are here only when documentation is built.
+//! The pages on formats and rules that comments cite, such as `docs/wire/recipes.md section 4`: the same files as in
+//! the package's folder `docs/`. They are included only when documentation is built.
 
-/// A page of `docs/wire/` as a module. In what it has of links to other pages, the first definition
-/// counts: the page's own, at its end, is for who reads the file.
+/// Includes a page of `docs/wire/` as a module. If a page defines the same link as here, the first definition counts;
+/// the one at the end of the page is for readers of the file.
 macro_rules! page {
     ($name:ident: $($link:ident)*) => {
         $(#[doc = concat!("[", stringify!($link), "]: ", stringify!($link))])*
@@ -13,9 +13,7 @@ macro_rules! page {
     };
 }
 
-/// [driver]: driver
-/// [wire]: wire
-/// [command]: wire::command
+/// [driver]: driver [wire]: wire [command]: wire::command
 #[doc = ""]
 #[doc = include_str!("../docs/engine.md")]
 pub mod engine {}
@@ -25,14 +23,8 @@ pub mod engine {}
 #[doc = include_str!("../docs/driver.md")]
 pub mod driver {}
 
-/// [engine]: engine
-/// [sysvars]: wire::sysvars
-/// [recipes]: wire::recipes
-/// [state]: wire::state
-/// [command]: wire::command
-/// [modbus]: wire::modbus
-/// [modbus_rtu]: wire::modbus_rtu
-/// [slcan]: wire::slcan
+/// [engine]: engine [sysvars]: wire::sysvars [recipes]: wire::recipes [state]: wire::state [command]: wire::command
+/// [modbus]: wire::modbus [modbus_rtu]: wire::modbus_rtu [slcan]: wire::slcan
 #[doc = ""]
 #[doc = include_str!("../docs/wire/README.md")]
 pub mod wire {
@@ -43,8 +35,7 @@ pub mod wire {
     page!(modbus: sysvars modbus_rtu);
     page!(slcan: );
 
-    /// [modbus]: modbus
-    /// [engine]: super::engine
+    /// [modbus]: modbus [engine]: super::engine
     #[doc = ""]
     #[doc = include_str!("../docs/wire/modbus-rtu.md")]
     pub mod modbus_rtu {}

@@ -1,5 +1,5 @@
-//! Durations counted in buckets of doubling width: enough for a median, a 99th percentile and a
-//! maximum, in constant memory and with a few instructions per sample.
+//! Counts durations in buckets of doubling width: enough for a median, a 99th percentile and a maximum, in constant
+//! memory and with a few instructions per sample.
 //!
 //! In: durations. Out: counts, percentiles, the maximum. Does not know what is measured.
 
@@ -10,8 +10,8 @@ pub const BUCKETS: usize = 24;
 
 /// Durations in power-of-two buckets of microseconds.
 ///
-/// Bucket 0 counts durations below 1 µs, bucket `n` durations from 2^(n-1) µs up to less than 2^n
-/// µs, and the last one everything from 2^22 µs (4.2 s) on. Counts saturate at 2^32 - 1.
+/// Bucket 0 counts durations below 1 µs, bucket `n` durations from 2^(n-1) µs to below 2^n µs, and the last one all
+/// from 2^22 µs (4.2 s) on. Counts saturate at 2^32 - 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Histogram {
@@ -37,7 +37,7 @@ impl Histogram {
         self.record_micros(u32::try_from(duration.as_micros()).unwrap_or(u32::MAX));
     }
 
-    /// Adds a sample of this many microseconds.
+    /// Adds a sample in microseconds.
     pub(crate) fn record_micros(&mut self, micros: u32) {
         let bits = u32::BITS.saturating_sub(micros.leading_zeros()) as usize;
         if let Some(count) = self.counts.get_mut(bits.min(BUCKETS - 1)) {
@@ -54,7 +54,7 @@ impl Histogram {
         self.counts.iter().map(|&count| u64::from(count)).sum()
     }
 
-    /// The sum of all samples. A sample longer than 2^32 µs (71 minutes) counts as that long.
+    /// The sum of all samples. A sample longer than 2^32 µs (71 minutes) counts as 2^32 µs.
     pub const fn sum(&self) -> Duration {
         Duration::from_micros(self.sum_us)
     }
@@ -69,15 +69,13 @@ impl Histogram {
         &self.counts
     }
 
-    /// The end of bucket `index`: every sample in it was shorter than this. [`Duration::MAX`] for
-    /// the last bucket and beyond.
+    /// The upper end of bucket `index`: all its samples were shorter. [`Duration::MAX`] for the last bucket and beyond.
     pub const fn bucket_end(index: usize) -> Duration {
         if index < BUCKETS - 1 { Duration::from_micros(1 << index) } else { Duration::MAX }
     }
 
-    /// The duration that `per_mille` thousandths of the samples did not exceed, rounded up to the
-    /// end of its bucket, and never more than the longest sample. `None` without a sample. The
-    /// median is 500, the 99th percentile 990.
+    /// The duration that `per_mille` thousandths of the samples did not exceed, rounded up to the end of its bucket,
+    /// but at most the longest sample. `None` without samples. Use 500 for the median, 990 for the 99th percentile.
     pub fn percentile(&self, per_mille: u16) -> Option<Duration> {
         let count = self.count();
         if count == 0 {
@@ -104,8 +102,8 @@ impl Histogram {
 
 #[cfg(feature = "serde")]
 impl serde::Serialize for Histogram {
-    /// The count, median, 99th percentile and maximum in microseconds, and the buckets. Percentiles
-    /// are absent without a sample.
+    /// Count, median, 99th percentile and maximum in microseconds, and the buckets. Percentiles are absent without
+    /// samples.
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         #[derive(serde::Serialize)]
         struct SerializedHistogram<'a> {

@@ -11,16 +11,15 @@
         clippy::arithmetic_side_effects
     )
 )]
-// The first definition of a link counts: here within this documentation, and in the file to docs.rs.
-//! [`docs::driver`]: crate::docs::driver
-//! [`docs::wire`]: crate::docs::wire
+// The first definition of a link wins: in this documentation the one here, elsewhere that of README.md (to docs.rs).
+//! [`docs::driver`]: crate::docs::driver [`docs::wire`]: crate::docs::wire
 //!
 #![doc = include_str!("../README.md")]
 
 #[cfg(any(test, feature = "std"))]
 extern crate std;
 
-/// The collections of the configuration: their version is this crate's, whatever else a program uses.
+/// Re-exported, because the configuration's collections must be of the same version.
 pub use heapless;
 
 pub mod command;

@@ -1,12 +1,11 @@
-//! Periods on a fixed grid: they keep phase, never burst, and count what was missed.
+//! Periods on a fixed grid: they keep their phase, never burst, and count missed deadlines.
 //!
-//! In: the present instant. Out: whether the period is due, and how many whole periods went by
-//! unserved. Refuses to know what is done each period.
+//! In: the present instant. Out: whether a deadline is due, and how many were missed. Does not know what is done in
+//! each period.
 
 use crate::time::{Duration, Instant};
 
-/// A period with an absolute grid: the n-th deadline is `start + n * period`, however late each
-/// one is served.
+/// A period with an absolute grid: the n-th deadline is `start + n * period`, however late it is served.
 #[derive(Debug, Clone, Copy)]
 pub struct Grid {
     next: Instant,
@@ -14,7 +13,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// Shortest period a grid can have; a shorter one is raised to it.
+    /// Shortest period of a grid; shorter ones are raised to it.
     pub const SHORTEST: Duration = Duration::from_micros(1);
 
     /// A grid whose first deadline is `first`.
@@ -33,8 +32,7 @@ impl Grid {
         self.period
     }
 
-    /// When a deadline has come: moves to the first one after `now` and returns how many others
-    /// went by with it unserved.
+    /// If a deadline is due, moves to the first one after `now` and returns how many others were missed.
     pub fn due(&mut self, now: Instant) -> Option<u64> {
         if now < self.next {
             return None;
@@ -47,16 +45,16 @@ impl Grid {
     }
 }
 
-/// Whether a slave answers.
+/// Whether a peer answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum Presence {
-    /// It has not been asked yet.
+    /// Not asked yet.
     Unknown,
-    /// It answered when it was last asked.
+    /// Answered when last asked.
     Up,
-    /// It did not answer when it was last asked.
+    /// Did not answer when last asked.
     Down,
 }
 

@@ -38,8 +38,7 @@ impl Instant {
     }
 }
 
-/// An instant that is all zeros for [`Instant::NEVER`]: instants that are not known yet take no
-/// flash.
+/// An instant that is all zeros for [`Instant::NEVER`]: instants that are not known yet take no flash.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Stamp(u64);
 

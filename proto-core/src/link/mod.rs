@@ -1,7 +1,7 @@
-//! Supervises one controller link: when to open it, when to give it up, when to try again.
+//! Supervises one link to the controller: when to open it, give it up, and try again.
 //!
-//! In: what the driver reports, and the engine's judgement of the peer. Out: actions and a
-//! deadline. Does not know sockets, protocols or addresses.
+//! In: the driver's reports, and the engine's judgement of the peer. Out: actions and a deadline. Does not know
+//! sockets, protocols or addresses.
 
 use crate::time::{Duration, Instant};
 
@@ -10,13 +10,13 @@ use crate::time::{Duration, Instant};
 pub(crate) struct LinkTimings {
     /// A link that is not up within this time is given up.
     pub(crate) connect_timeout: Duration,
-    /// The wait after the first loss; it doubles after each further one.
+    /// The wait after the first loss; doubled after each further one.
     pub(crate) backoff_min: Duration,
     /// The longest wait.
     pub(crate) backoff_max: Duration,
-    /// A link that was up for this long starts again with the shortest wait.
+    /// After this time up, the next wait is the shortest one again.
     pub(crate) settled_after: Duration,
-    /// A link on which nothing arrives for this long is closed; `None` where silence is normal.
+    /// A link without received bytes for this long is closed; `None` if silence is normal.
     pub(crate) silence: Option<Duration>,
 }
 
@@ -30,11 +30,11 @@ impl LinkTimings {
         silence: None,
     };
 
-    /// For links that the controller opens: it may do so only after days, and that is no failure.
+    /// For links that the controller opens; it may do so only after days, which is not a failure.
     pub(crate) const LISTENING: Self =
         Self { connect_timeout: Duration::MAX, backoff_max: Self::TCP.backoff_min, ..Self::TCP };
 
-    /// Same, but closed after `silence` without a byte.
+    /// Closes the link after `silence` without received bytes.
     #[must_use]
     pub(crate) const fn with_silence(self, silence: Duration) -> Self {
         Self { silence: Some(silence), ..self }
@@ -44,7 +44,7 @@ impl LinkTimings {
 /// The state of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-// Otherwise the tag would be as wide as an instant, which takes two registers on a Cortex-M.
+// Otherwise the tag would be as wide as an instant, and take two registers on a Cortex-M.
 #[repr(u8)]
 pub enum LinkState {
     /// Closed; opened again at `retry_at`.
@@ -62,7 +62,7 @@ pub enum LinkState {
         /// When it came up.
         since: Instant,
     },
-    /// Not opened: the peer takes only one connection, and another link carries this one's traffic.
+    /// Not opened: the peer accepts only one connection, and another link carries this link's traffic.
     Shared,
 }
 
@@ -78,12 +78,12 @@ impl LinkState {
     }
 }
 
-/// A task for the driver.
+/// An action for the driver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum LinkAction {
-    /// Open the link and report when it is up or has failed.
+    /// Open the link and report whether it came up or failed.
     Open,
-    /// Close it and report nothing more about it.
+    /// Close it and stop reporting about it.
     Close,
 }
 
@@ -91,13 +91,13 @@ pub(crate) enum LinkAction {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default))]
 pub struct LinkHistory {
-    /// Times the link came up.
+    /// Number of times the link came up.
     pub connects: u32,
-    /// Times it was lost after it had been up, whichever side closed it.
+    /// Number of times it was lost after it was up, by either side.
     pub losses: u32,
-    /// Times it could not be opened.
+    /// Number of times it could not be opened.
     pub failed_opens: u32,
-    /// Times it was closed because nothing arrived.
+    /// Number of times it was closed because of silence.
     pub silences: u32,
 }
 
@@ -106,7 +106,7 @@ pub struct LinkHistory {
 pub(crate) struct Supervisor {
     timings: &'static LinkTimings,
     state: LinkState,
-    /// How often the wait has doubled.
+    /// Number of times the wait has doubled.
     doubled: u8,
     heard: Instant,
     action: Option<LinkAction>,
@@ -114,7 +114,7 @@ pub(crate) struct Supervisor {
 }
 
 impl Supervisor {
-    /// The supervisor of a link that is to be opened at once.
+    /// The supervisor of a link that is opened at once.
     pub(crate) const fn new(timings: &'static LinkTimings) -> Self {
         Self {
             timings,
@@ -141,8 +141,8 @@ impl Supervisor {
         &self.history
     }
 
-    /// The driver reports that the link is up. False if that was not expected: the report is late,
-    /// and the driver has already been told to close the link.
+    /// The driver reports that the link is up. Returns false if that was not expected: the report is late, and the
+    /// driver has already been told to close the link.
     pub(crate) fn up(&mut self, now: Instant) -> bool {
         if !matches!(self.state, LinkState::Opening { .. }) || self.is_to_be_opened() {
             return false;
@@ -153,7 +153,7 @@ impl Supervisor {
         true
     }
 
-    /// The driver reports that the link is gone or could not be opened. True if it was up.
+    /// The driver reports that the link is gone or could not be opened. Returns whether the link was up.
     pub(crate) fn down(&mut self, now: Instant) -> bool {
         if self.is_to_be_opened() {
             return false;
@@ -165,8 +165,7 @@ impl Supervisor {
         matches!(was, LinkState::Up { .. })
     }
 
-    /// Whether the link has yet to be opened by the driver: what it reports belongs to an earlier
-    /// connection.
+    /// Whether the driver has yet to open the link: until then, its reports are about an earlier connection.
     fn is_to_be_opened(&self) -> bool {
         self.action == Some(LinkAction::Open)
     }
@@ -176,7 +175,7 @@ impl Supervisor {
         self.heard = now;
     }
 
-    /// The engine gives the link up because the peer sends nonsense or nothing.
+    /// The engine gives the link up, because the peer sends invalid data or nothing.
     pub(crate) fn give_up(&mut self, now: Instant) {
         if !matches!(self.state, LinkState::Down { .. } | LinkState::Shared) {
             self.fall(now);
@@ -184,13 +183,13 @@ impl Supervisor {
         }
     }
 
-    /// Another link carries this one's traffic from now on.
+    /// From now on, another link carries this link's traffic.
     pub(crate) fn share(&mut self, now: Instant) {
         self.give_up(now);
         self.state = LinkState::Shared;
     }
 
-    /// The link carries its own traffic again; it is opened after the shortest wait.
+    /// The link carries its own traffic again; opens it after the shortest wait.
     pub(crate) fn unshare(&mut self, now: Instant) {
         if self.state == LinkState::Shared {
             self.doubled = 0;
@@ -198,7 +197,7 @@ impl Supervisor {
         }
     }
 
-    /// Checks the deadlines. True if the link was up and has just been given up because of silence.
+    /// Checks the deadlines. Returns whether the link was up and has just been given up because of silence.
     pub(crate) fn advance(&mut self, now: Instant) -> bool {
         match self.state {
             LinkState::Down { retry_at } if now >= retry_at && self.action.is_none() => {
@@ -216,7 +215,7 @@ impl Supervisor {
         false
     }
 
-    /// The task for the driver, once.
+    /// Takes the pending action for the driver.
     pub(crate) fn take_action(&mut self) -> Option<LinkAction> {
         self.action.take()
     }

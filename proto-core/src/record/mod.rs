@@ -1,8 +1,8 @@
-//! Runs of an engine as bytes: every input with its instant and every output, to be replayed by
-//! another engine elsewhere (docs/cortex-m7.md section 1).
+//! Recordings of an engine: every input with its instant, and every output, to be replayed by another engine
+//! (docs/cortex-m7.md section 1).
 //!
-//! In: what goes into an engine and comes out of it, or a recording. Out: the other. A recording that
-//! is cut or changed is refused; nothing that stands in one can panic. Knows no file and no clock.
+//! In: an engine's inputs and outputs, or a recording. Out: the other. A recording that is cut or changed is refused;
+//! no content can cause a panic. Does not know files or clocks.
 
 mod replay;
 
@@ -17,7 +17,7 @@ use crate::engine::{BusState, Endpoint, Engine, Input, LinkId, Output, PortId, T
 use crate::time::Instant;
 use crate::wire::can::{CanFrame, CanId, MAX_CAN_DATA};
 
-/// The first bytes of every recording; the last one is the format's version.
+/// The first bytes of every recording; the last of them is the format's version.
 pub const MAGIC: [u8; 4] = *b"RGR\x03";
 
 /// Longest [`Entry::Totals`].
@@ -26,7 +26,7 @@ pub(crate) const MAX_TOTALS: usize = 3072;
 /// One entry of a recording.
 #[derive(Debug, Clone, Copy)]
 pub enum Entry<'a> {
-    /// An engine begins, with this configuration image.
+    /// An engine starts with this configuration image.
     Start {
         /// The image ([`crate::config::image`]).
         image: &'a [u8],
@@ -47,7 +47,7 @@ pub enum Entry<'a> {
 }
 
 impl<'a> Entry<'a> {
-    /// The entry that `bytes` begin with, and what follows it; `None` if they do not begin with one.
+    /// Splits the first entry from `bytes`, and returns the rest too; `None` if `bytes` do not begin with an entry.
     pub fn parse(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
         let mut body = EntryReader(bytes);
         let entry = match body.byte()? {
@@ -83,10 +83,10 @@ impl<'a> Entry<'a> {
     }
 }
 
-/// The counters of every field port and link and the values of the image: what an engine became by
-/// its inputs, beside what it said.
+/// The counters of every field port and link, and the values of the image: the state that the inputs led to, besides
+/// the outputs.
 ///
-/// Of each port and link its number and its counters as postcard has them, then the image.
+/// For each port and link its number and its counters in postcard format, then the image.
 pub fn totals<
     const PORTS: usize,
     const UPLINKS: usize,
@@ -138,15 +138,15 @@ mod tag {
     pub(super) const LINK_SEND: u8 = 0x25;
 }
 
-/// Bit 31 of a recorded CAN id: 29 bits. Bit 30: a remote frame.
+/// Bit 31 of a recorded CAN id: an extended id. Bit 30: a remote frame.
 const EXTENDED: u32 = 1 << 31;
 const REMOTE: u32 = 1 << 30;
 
-/// Longest address that postcard writes: its kind, an IPv6 address, a port.
+/// Longest address in postcard format: its kind, an IPv6 address, a port.
 const MAX_ADDRESS: usize = 1 + 16 + 3;
 
-/// Everything of an entry but the bytes at its end: tag, two numbers of up to ten bytes, a port and
-/// a CAN frame at most.
+/// An entry without the bytes at its end. The longest one has a tag, two numbers of up to ten bytes, a port and a CAN
+/// frame.
 #[derive(Default)]
 struct EntryHead(Vec<u8, 40>);
 
@@ -160,7 +160,7 @@ impl EntryHead {
         self
     }
 
-    /// Seven bits a byte, the lowest first; all but the last with bit 7.
+    /// Seven bits per byte, lowest first; bit 7 is set in all but the last.
     fn number(&mut self, mut number: u64) -> &mut Self {
         while number > 0x7F {
             self.byte(number as u8 | 0x80);

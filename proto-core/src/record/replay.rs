@@ -1,4 +1,4 @@
-//! A recording's inputs for another engine; what that engine says, as a recording.
+//! Replays a recording's inputs on another engine, and records its outputs.
 
 use core::fmt;
 
@@ -14,12 +14,12 @@ use crate::time::Instant;
 pub enum ReplayError {
     /// It does not begin with [`MAGIC`].
     NotARecording,
-    /// The bytes there are not an entry: cut, or changed.
+    /// The bytes at `at` are not an entry: the recording is cut or changed.
     Entry {
         /// Offset of its first byte.
         at: usize,
     },
-    /// There are inputs before an engine began.
+    /// An input comes before the first engine started.
     NoStart,
     /// The configuration image is refused.
     Image(ImageError),
@@ -41,23 +41,22 @@ impl fmt::Display for ReplayError {
 
 impl core::error::Error for ReplayError {}
 
-/// The size of a replay.
+/// Number of inputs and outputs of a replay.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Replayed {
-    /// Inputs handed to the engine.
+    /// Inputs passed to the engine.
     pub inputs: usize,
-    /// What it returned for them.
+    /// Outputs that it returned.
     pub outputs: usize,
 }
 
-/// Gives the inputs of `recording` to `engine`, at their instants, and writes the recording that comes
-/// of it: the same inputs, and this engine's outputs and totals. It equals `recording` when both
-/// engines behave the same.
+/// Passes the inputs of `recording` to `engine`, at their instants, and writes a new recording: the same inputs, with
+/// this engine's outputs and totals. It equals `recording` if both engines behave the same.
 ///
-/// `config` is a place to work in; boards have none to spare on the stack.
+/// `config` is working memory; boards do not have enough stack for it.
 ///
 /// # Errors
-/// [`ReplayError`]; what was written until then is this engine's.
+/// [`ReplayError`]; what was written until then comes from this engine.
 pub fn replay<
     const PORTS: usize,
     const UPLINKS: usize,

@@ -8,7 +8,7 @@ const PORT: PortId = PortId(3);
 const LINK: LinkId = LinkId(200);
 const AT: Instant = Instant::from_micros(1_000_000_300);
 
-/// As long as a host may be.
+/// The maximum length of a host name.
 static HOST: &str = "0123456789abcdef0123456789abcdef0123456789abcdef0123456789abcdef";
 
 fn open(transport: Transport, host: &'static str) -> Output<'static> {
