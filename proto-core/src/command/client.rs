@@ -1,8 +1,8 @@
-//! The gateway's side of a port-2000 connection: one request in flight, one urgent request beside
-//! it, and where their replies end (docs/wire/command.md section 6).
+//! The gateway's side of a port-2000 connection: one request in flight, one urgent request besides it, and how the ends
+//! of their replies are found (docs/wire/command.md section 6).
 //!
-//! In: a command to send, received bytes and the time. Out: the bytes to send, replies, unsolicited
-//! texts, and a timeout. Does not decide what to send or to repeat.
+//! In: a command to send, received bytes and the time. Out: the bytes to send, replies, unsolicited texts, and a
+//! timeout. Does not decide what to send or to repeat.
 
 use core::cell::Cell;
 use core::fmt;
@@ -18,27 +18,26 @@ pub const MAX_REPLY: usize = 320;
 
 /// One connection to port 2000.
 ///
-/// Call [`receive`](Self::receive) with each piece until it returns `None`; call
-/// [`poll`](Self::poll) until `None` when [`deadline`](Self::deadline) has come. Polling early is
-/// harmless.
+/// Call [`receive`](Self::receive) with each piece until it returns `None`; when [`deadline`](Self::deadline) is
+/// reached, call [`poll`](Self::poll) until it returns `None`. Polling early is harmless.
 #[derive(Debug, Clone)]
 pub struct CommandClient {
-    /// A reply that further bytes could make longer is complete after this much silence: 20 ms.
+    /// A reply that further bytes could extend is complete after this much silence: 20 ms.
     pub quiet_gap: Duration,
-    /// The same for the reply to `getlasterror`, whose free text may come in pieces: 100 ms.
+    /// Like `quiet_gap`, for the reply to `getlasterror`, whose free text may come in pieces: 100 ms.
     pub message_gap: Duration,
-    /// A request without a reply is given up after this long: 10 s. Powering on takes seconds,
-    /// and its reply comes at its end.
+    /// A request without a reply is given up after this time: 10 s. Powering on takes seconds, and its reply comes at
+    /// the end.
     pub timeout: Duration,
-    /// The older of the requests in flight.
+    /// The older request in flight.
     waiting: Option<PendingRequest>,
-    /// The urgent request that was sent without waiting for the other's reply.
+    /// The urgent request, sent without waiting for the reply to the older one.
     beside: Option<PendingRequest>,
     buffer: [u8; MAX_REPLY],
     len: usize,
-    /// Bytes at the front that were returned; they are removed by the next call.
+    /// Number of bytes at the front that were returned; the next call removes them.
     handed_out: usize,
-    /// After a text that was too long, until its end.
+    /// Dropping the rest of a text that was too long.
     dropping: bool,
     newest: Instant,
     dropped: u32,
@@ -51,17 +50,17 @@ struct PendingRequest {
     /// When it was written.
     since: Instant,
     until: Instant,
-    /// An unknown text has come that may be its reply.
+    /// An unknown text was received that may be its reply.
     has_text: bool,
 }
 
 /// The result of a request, or an unsolicited text.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ClientEvent<'a> {
-    /// The reply to a request in flight, which is then over.
+    /// The reply to a request in flight, which has then ended.
     Reply {
-        /// Whether it was the newer of two requests. When the older one has its reply, the newer
-        /// one is the only one.
+        /// Whether it replies to the newer of two requests. After the reply to the older one, the newer one is the only
+        /// one in flight.
         beside: bool,
         /// The kind of answer.
         kind: ReplyKind,
@@ -72,17 +71,16 @@ pub enum ClientEvent<'a> {
     },
     /// A program that was started from port 2000 has ended.
     ScriptFinish,
-    /// A text that answers no request in flight: a late reply, or an unknown text. No request is
-    /// over.
+    /// A text that answers no request in flight: a late reply, or an unknown text. All requests stay in flight.
     Unsolicited {
         /// The text, without a terminator.
         text: &'a [u8],
-        /// The request in flight whose reply in unknown words it may be: that beside the older one if
-        /// `true`. `None` for a late reply, or if no request can be meant.
+        /// The request in flight that the unknown text may be a reply to: `true` for the urgent one besides the older
+        /// one. `None` for a late reply, or if it can be no request.
         beside: Option<bool>,
     },
-    /// The request in flight is given up. A reply may still come, as an unsolicited text; a value
-    /// would be taken for the next reply of its kind, so reconnect before the next request.
+    /// The request in flight is given up. Its reply may still come, as an unsolicited text; a value would be taken for
+    /// the next reply of its kind, so reconnect before the next request.
     Timeout,
 }
 
@@ -134,18 +132,18 @@ impl CommandClient {
         self.waiting.is_some()
     }
 
-    /// Whether two requests are in flight, so that no other can be sent.
+    /// Whether two requests are in flight, so that no other one can be sent.
     pub const fn busy_beside(&self) -> bool {
         self.beside.is_some()
     }
 
-    /// Bytes of texts longer than [`MAX_REPLY`] that were dropped, wrapping.
+    /// Number of dropped bytes of texts longer than [`MAX_REPLY`], wrapping.
     pub const fn dropped_bytes(&self) -> u32 {
         self.dropped
     }
 
-    /// Writes the command `text` in the dialect's form to the front of `out` and returns its
-    /// length; the request is then in flight.
+    /// Writes the command `text` in the dialect's form to the front of `out` and returns its length. The request is
+    /// then in flight.
     ///
     /// # Errors
     /// [`StartError`]; nothing was started then.
@@ -160,7 +158,7 @@ impl CommandClient {
         self.start_request(now, &request, dialect, out)
     }
 
-    /// Same as [`start`](Self::start), for a request that is not text yet.
+    /// Like [`start`](Self::start), for a parsed request.
     ///
     /// # Errors
     /// [`StartError`]; nothing was started then.
@@ -176,7 +174,7 @@ impl CommandClient {
         }
         let len = request.encode(dialect, out).map_err(StartError::Encode)?;
         self.drop_handed_out();
-        // Bytes that came before the request cannot be the beginning of its reply.
+        // Bytes received before the request cannot be part of its reply.
         if !SCRIPT_FINISH.as_bytes().starts_with(self.received()) {
             self.len = 0;
         }
@@ -184,14 +182,13 @@ impl CommandClient {
         Ok(len)
     }
 
-    /// Writes an urgent command without waiting for the reply to the request in flight. Replies are
-    /// matched by their keywords (D26); a reply that fits both belongs to the older request. If the
-    /// older one is a keyword with nothing after it, a line feed ends it first: `resumestop` is not
-    /// a command (D2). Without a request in flight this is the same as [`start`](Self::start).
+    /// Writes an urgent command without waiting for the reply to the request in flight. Replies are matched by their
+    /// keywords (D26); a reply that fits both belongs to the older request. If the older one is a keyword with nothing
+    /// after it, a line feed ends it first, because `resumestop` is not a command (D2). Without a request in flight
+    /// this is the same as [`start`](Self::start).
     ///
     /// # Errors
-    /// [`StartError`]; nothing was started then. [`StartError::Busy`] if two requests are already
-    /// in flight.
+    /// [`StartError`]; nothing was started then. [`StartError::Busy`] if two requests are already in flight.
     pub fn start_beside(
         &mut self,
         now: Instant,
@@ -222,8 +219,8 @@ impl CommandClient {
         PendingRequest { keyword, since: now, until: now + self.timeout, has_text: false }
     }
 
-    /// Takes bytes from the front of `bytes` until an event is complete. `None` means that all of
-    /// them were taken and no event is complete.
+    /// Takes bytes from the front of `bytes` until an event is complete. `None` if all are taken and no event is
+    /// complete.
     pub fn receive(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<ClientEvent<'_>> {
         self.drop_handed_out();
         let mut silent = self.gap().is_some_and(|gap| now >= self.newest + gap);
@@ -248,12 +245,12 @@ impl CommandClient {
         }
     }
 
-    /// An event that silence has completed by `now`, or a timeout.
+    /// Returns an event that silence has completed by `now`, or a timeout.
     pub fn poll(&mut self, now: Instant) -> Option<ClientEvent<'_>> {
         self.receive(now, &mut &[][..])
     }
 
-    /// When to call [`poll`](Self::poll) if no more bytes are received.
+    /// When to call [`poll`](Self::poll) if no more bytes arrive.
     pub fn deadline(&self) -> Option<Instant> {
         let gap = self.gap().map(|gap| self.newest + gap);
         match (gap, self.timeout_at()) {
@@ -262,7 +259,7 @@ impl CommandClient {
         }
     }
 
-    /// Forgets the requests in flight and everything received, for a new connection.
+    /// Drops the requests in flight and all received bytes, for a new connection.
     pub fn abort(&mut self) {
         self.waiting = None;
         self.beside = None;
@@ -271,7 +268,7 @@ impl CommandClient {
         self.dropping = false;
     }
 
-    /// Reads the front of the buffer, which enough silence has followed or not.
+    /// Interprets the front of the buffer. `silent` says whether enough silence has followed.
     fn scan(&mut self, silent: bool) -> Option<Scanned> {
         let blanks = self.received().iter().take_while(|&&byte| is_blank(byte)).count();
         self.drop_front(blanks);
@@ -298,7 +295,7 @@ impl CommandClient {
                     return None;
                 }
                 let end = line.unwrap_or(bytes.len());
-                // A reply may be glued to an unknown text.
+                // A reply may directly follow an unknown text.
                 let glued = (1..end).find(|&at| {
                     let rest = bytes.get(at..).unwrap_or(&[]);
                     matches!(match_fixed(rest), Match::Complete { .. })
@@ -308,7 +305,7 @@ impl CommandClient {
         }
     }
 
-    /// What the front of `bytes` is, given the request in flight.
+    /// Matches the front of `bytes`, given the request in flight.
     fn front<'b>(&self, bytes: &'b [u8]) -> Match<'b> {
         let fixed = match_fixed(bytes);
         if matches!(fixed, Match::Complete { .. }) {
@@ -330,12 +327,12 @@ impl CommandClient {
         }
     }
 
-    /// What the unknown text at the front is: a failure if it names a request and says so. Otherwise
-    /// it may be the reply to the request that it names, or to the oldest that has had no text yet.
+    /// Interprets the unknown text at the front: it is a failure if it names a request and reports one. Otherwise it
+    /// may be a reply to the request that it names, or else to the oldest request that has had no text yet.
     fn judge_words(&self, len: usize) -> Scanned {
         let text = self.received().get(..len).unwrap_or(&[]);
         let requests = [(false, self.waiting), (true, self.beside)];
-        // A text that was there before a request was written is not its reply.
+        // A text that was received before a request was sent is not its reply.
         let requests = requests.into_iter().filter_map(|(beside, waiting)| Some((beside, waiting?)));
         let requests = requests.filter(|(_, waiting)| waiting.since <= self.newest);
         let named = requests.clone().filter_map(|(beside, waiting)| {
@@ -352,13 +349,13 @@ impl CommandClient {
         }
     }
 
-    /// When the older request is given up.
+    /// When the first request in flight is given up.
     fn timeout_at(&self) -> Option<Instant> {
         let waiting = self.waiting.iter().chain(&self.beside);
         waiting.map(|waiting| waiting.until).min()
     }
 
-    /// The silence that would end the text in the buffer.
+    /// The silence that ends the text in the buffer.
     fn gap(&self) -> Option<Duration> {
         if self.dropping {
             return Some(self.message_gap);
@@ -385,7 +382,7 @@ impl CommandClient {
                 *place = byte;
                 self.len = self.len.saturating_add(1);
             }
-            // No beginning of a reply fills the whole buffer: see the longest replies.
+            // The beginning of a reply is never as long as the buffer: see the longest replies.
             None => self.len = 0,
         }
     }
@@ -434,7 +431,7 @@ impl CommandClient {
             && let Some(held) = self.buffer.get_mut(..self.len)
             && count <= held.len()
         {
-            // Same as `copy_within`, without a range check.
+            // Like `copy_within`, without a range check.
             let held = Cell::from_mut(held).as_slice_of_cells();
             for (to, from) in held.iter().zip(held.iter().skip(count)) {
                 to.set(from.get());

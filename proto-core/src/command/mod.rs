@@ -1,8 +1,7 @@
 //! Port 2000, both sides: short ASCII commands and their replies (docs/wire/command.md).
 //!
-//! In: bytes in pieces of any size, and the time. Out: requests for the simulated controller,
-//! replies for the gateway. Knows the texts and how to distinguish them. Does not know connections,
-//! and never decides whether a command is allowed.
+//! In: bytes in chunks of any size, and the time. Out: requests for the simulated controller, replies for the gateway.
+//! Does not know connections, nor which commands are allowed.
 
 mod client;
 mod percent;

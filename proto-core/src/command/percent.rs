@@ -1,7 +1,7 @@
 //! A speed in percent, and its text.
 //!
-//! In: a number, or its decimal text. Out: the other. The parsing and printing of floats in `core`
-//! is not used: it takes about 20 KiB, with checks that no compiler can remove.
+//! In: a number, or its decimal text. Out: the other. `core`'s parsing and printing of floats is not used: it takes
+//! about 20 KiB, with panics that no compiler can remove.
 
 use core::fmt;
 
@@ -14,7 +14,7 @@ use crate::wire::ascii::split_once;
 pub struct Percent(f32);
 
 impl Percent {
-    /// `percent` if it is in (0, 100].
+    /// `percent` if it is above 0 and at most 100.
     pub fn new(percent: f32) -> Option<Self> {
         (percent > 0.0 && percent <= 100.0).then_some(Self(percent))
     }
@@ -24,13 +24,13 @@ impl Percent {
         self.0
     }
 
-    /// The speed in decimal text, surrounding blanks ignored; the binary32 nearest to it as far as
-    /// its first 19 digits determine. Less than 1e-30 is not a speed.
+    /// Parses a decimal text, ignoring surrounding blanks, to the nearest binary32; only its first 19 digits decide.
+    /// Values below 1e-30 are refused.
     pub fn parse(text: &str) -> Option<Self> {
         Self::new(Decimal::parse(trim_str(text))?.nearest()?)
     }
 
-    /// The shortest decimal number that is parsed as this speed, with at most 30 decimals.
+    /// The shortest decimal number that parses to this speed, with at most 30 decimals.
     fn decimal(self) -> Decimal {
         let is_same = |decimal: &Decimal| decimal.nearest() == Some(self.0);
         let mut all = (0..MAX_DECIMALS).map(|decimals| Decimal::round(self.0, decimals));
@@ -49,18 +49,17 @@ impl fmt::Display for Percent {
     }
 }
 
-/// `digits` with the decimal point before the last `decimals` of them.
+/// `digits` with a decimal point before the last `decimals` digits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Decimal {
     digits: u64,
     decimals: u32,
-    /// More digits follow than fit, and not all of them are 0.
+    /// The number has more digits, and not all of them are 0.
     more: bool,
 }
 
 impl Decimal {
-    /// The number in the text. `None` if it is not a number above 0, or far beyond the range of a
-    /// speed.
+    /// Parses a number. `None` if it is not a number above 0, or far above the range of a speed.
     fn parse(text: &str) -> Option<Self> {
         let (number, exponent) = match text.split_once(['e', 'E']) {
             Some((number, exponent)) => (number, exponent.parse().ok()?),
@@ -84,7 +83,7 @@ impl Decimal {
                 decimals = decimals.saturating_sub(1).saturating_add(behind_the_point);
             }
         }
-        // Bounded by the length of a u64, since `digits` is not 0.
+        // Bounded by the range of u64, because `digits` is not 0.
         while digits != 0 && decimals < 0 {
             digits = digits.checked_mul(10)?;
             decimals = decimals.saturating_add(1);
@@ -97,7 +96,7 @@ impl Decimal {
         (digits != 0).then_some(Self { digits, decimals: decimals.unsigned_abs(), more })
     }
 
-    /// `value`, above 0 and at most 100, rounded to this many decimals.
+    /// Rounds `value`, above 0 and at most 100, to this many decimals.
     fn round(value: f32, decimals: u32) -> Self {
         let bits = value.to_bits();
         let (exponent, fraction) = (bits >> FRACTION_BITS, bits & FRACTION);
@@ -120,13 +119,13 @@ impl Decimal {
         let scaled = digits.unbounded_shl(shift);
         let quotient = scaled.checked_div(divisor)?;
         let inexact = self.more || scaled.checked_rem(divisor) != Some(0);
-        // The quotient has more than 26 bits, so its last one only tells a number in the middle
-        // between two binary32 from one beyond it.
+        // The quotient has more than 26 bits, so ORing into the last one only distinguishes a tie between two binary32
+        // from a number above it.
         let unit = f32::from_bits(127_u32.saturating_sub(shift) << FRACTION_BITS);
         Some((quotient | u128::from(inexact)) as f32 * unit)
     }
 
-    /// The number as text.
+    /// The characters of the number.
     fn bytes(self) -> impl Iterator<Item = u8> {
         let length = self.digits.checked_ilog10().unwrap_or(0);
         (0..=length.max(self.decimals)).rev().flat_map(move |place| {
@@ -138,9 +137,9 @@ impl Decimal {
     }
 }
 
-/// More decimals than any speed needs, and as many as 10^n fits with a binary32's digits into 128 bits.
+/// More decimals than any speed needs; 10^30 times a binary32's mantissa still fits in 128 bits.
 const MAX_DECIMALS: u32 = 30;
-/// Ten times as much, and a digit, fit into 64 bits; as many digits tell any two binary32 apart.
+/// Ten times this number plus a digit fits in 64 bits; this many digits distinguish all binary32 numbers.
 const ENOUGH: u64 = 1_000_000_000_000_000_000;
 
 const FRACTION_BITS: u32 = 23;
@@ -184,7 +183,7 @@ mod tests {
 
     #[test]
     fn long_texts_are_rounded_once() {
-        // 64 + 1 / 2^18 lies in the middle between two binary32.
+        // 64 + 1 / 2^18 is half-way between two binary32.
         assert_eq!(Percent::parse("64.00000381469726562"), percent(64.0));
         assert_eq!(Percent::parse("64.00000381469726563"), percent(64.000_01));
         assert_eq!(Percent::parse(&format!("12.5{}9", "0".repeat(60))), percent(12.5));

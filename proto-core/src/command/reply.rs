@@ -1,7 +1,7 @@
 //! The controller's replies (docs/wire/command.md sections 3 and 4).
 //!
-//! In: a [`Reply`] to be written in a [`Dialect`]'s form, or the text of one to be read. The end of
-//! a reply is found by the client ([`CommandClient`](super::CommandClient)).
+//! In: a [`Reply`] to format as a [`Dialect`] requires, or the text of one to parse.
+//! [`CommandClient`](super::CommandClient) finds the end of a reply.
 
 use core::fmt;
 
@@ -15,7 +15,7 @@ use crate::wire::state::{OperationMode, ProgramState, RobotState, SafetyState};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ActionOutcome {
-    /// Done, or started.
+    /// Executed, or started.
     Success,
     /// Refused.
     Fail,
@@ -35,12 +35,12 @@ impl ActionOutcome {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Reply<'a> {
-    /// To `run`: `run start` or `run success`, `run fail`.
+    /// To `run`: `run start`, `run success` or `run fail`.
     Run(ActionOutcome),
-    /// To `speed`, done: `set success`, or `set speed 50%`. `None` if read from `set success`,
-    /// which has no value; it is then written as `set success` in every dialect.
+    /// To an executed `speed`: `set success`, or `set speed 50%`. `None` if parsed from `set success`, which has no
+    /// value; it is then written as `set success` in every dialect.
     SpeedSet(Option<Percent>),
-    /// To `speed`, refused: `set fail`.
+    /// To a refused `speed`: `set fail`.
     SpeedRefused,
     /// To an action.
     Did {
@@ -49,7 +49,7 @@ pub enum Reply<'a> {
         /// The result.
         outcome: ActionOutcome,
     },
-    /// To an action of which nothing is left to do: `already poweron`. It is as good as done.
+    /// To an action whose state is already reached, such as `already poweron`. As good as success.
     Already(Action),
     /// To `state`.
     State(StateCodes),
@@ -62,7 +62,7 @@ pub enum Reply<'a> {
         /// Its text; not always UTF-8.
         message: &'a [u8],
     },
-    /// To everything else (D5).
+    /// To anything that is not a command (D5).
     UnknownCommand,
     /// A program that was started from port 2000 has ended.
     ScriptFinish,
@@ -106,22 +106,22 @@ impl fmt::Display for StateCodes {
     }
 }
 
-/// The kind of answer that a reply is.
+/// The kind of a reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum ReplyKind {
-    /// The command was carried out.
+    /// The command was executed.
     Success,
     /// The command was refused.
     Fail,
-    /// A question was answered.
+    /// A query was answered.
     Value,
     /// The controller does not know the command.
     UnknownCommand,
 }
 
 impl<'a> Reply<'a> {
-    /// The kind of answer; [`ReplyKind::Value`] for the unsolicited text.
+    /// The kind of the reply; [`ReplyKind::Value`] for the unsolicited text.
     pub const fn kind(&self) -> ReplyKind {
         match self {
             Self::Run(ActionOutcome::Success)
@@ -138,11 +138,11 @@ impl<'a> Reply<'a> {
         }
     }
 
-    /// Writes the reply, with the dialect's terminator, to the front of `out` and returns its
-    /// length. Control characters in an error's message become blanks.
+    /// Writes the reply, with the dialect's terminator, to the front of `out` and returns its length. Control
+    /// characters in an error's message become blanks.
     ///
     /// # Errors
-    /// [`NoTextSpace`] when `out` is too short.
+    /// [`NoTextSpace`] if `out` is too short.
     pub fn encode(&self, dialect: &Dialect, out: &mut [u8]) -> Result<usize, NoTextSpace> {
         let mut writer = CountingWriter::new(out);
         let mut terminator = dialect.reply_terminator;
@@ -182,7 +182,7 @@ impl<'a> Reply<'a> {
                 for &byte in message {
                     writer.push(&[if byte.is_ascii_control() { b' ' } else { byte }]);
                 }
-                // This reply has a terminator in every version (D4).
+                // This reply ends with a terminator in every version (D4).
                 if terminator == Terminator::None {
                     terminator = Terminator::Lf;
                 }
@@ -194,9 +194,9 @@ impl<'a> Reply<'a> {
         writer.finish()
     }
 
-    /// Reads the whole text of a reply to `keyword`, in the form of any dialect, with or without a
-    /// terminator. A text that names the command and contains `fail`, `failed` or `error` is a
-    /// failure, whatever else it says. `None` if it is not a reply to `keyword`.
+    /// Parses the whole text of a reply to `keyword`, in the form of any dialect, with or without a terminator. A text
+    /// that names the command and contains `fail`, `failed` or `error` is a failure, whatever else it says. `None` if
+    /// the text is not a reply to `keyword`.
     pub fn parse(keyword: Keyword, text: &'a [u8]) -> Option<Self> {
         let text = trim(text);
         let whole = |found: Match<'a>| match found {
@@ -211,7 +211,7 @@ impl<'a> Reply<'a> {
             .or_else(|| failure(keyword, text))
     }
 
-    /// Whether this can be an answer to `keyword`.
+    /// Whether this can be a reply to `keyword`.
     pub(super) fn answers(&self, keyword: Keyword) -> bool {
         match *self {
             Self::Run(_) => keyword == Keyword::Run,
@@ -226,20 +226,20 @@ impl<'a> Reply<'a> {
     }
 }
 
-/// What the front of received bytes is.
+/// The match of received bytes with the known replies.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Match<'a> {
-    /// A complete reply of `len` bytes, whatever follows.
+    /// The bytes begin with a complete reply of `len` bytes; further bytes cannot change it.
     Complete { len: usize, reply: Reply<'a> },
-    /// A reply of `len` bytes, all there are; further bytes could make it longer.
+    /// All `len` bytes are a reply, but further bytes could extend it.
     Open { len: usize, reply: Reply<'a> },
     /// The beginning of a reply.
     Partial,
-    /// None of these.
+    /// No reply.
     No,
 }
 
-/// Replies whose text does not depend on a value; none is the beginning of another.
+/// Matches replies whose text does not depend on a value; none is a prefix of another.
 pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
     let texts = [
         (RUN_START, Reply::Run(ActionOutcome::Success)),
@@ -308,13 +308,13 @@ pub(super) fn match_fixed(bytes: &[u8]) -> Match<'static> {
     if partial { Match::Partial } else { Match::No }
 }
 
-/// Replies that are values; checked only if `keyword` asked for one.
+/// Matches replies that are values, if `keyword` requests one.
 pub(super) fn match_value(keyword: Keyword, bytes: &[u8]) -> Match<'_> {
     match keyword {
         Keyword::State => match_state(bytes),
         Keyword::IsProgFinish => match bytes {
             [] => Match::Partial,
-            // A longer number is not this reply.
+            // A longer number is no reply.
             [_, b'0'..=b'9' | b':', ..] => Match::No,
             [b'0', ..] => Match::Complete { len: 1, reply: Reply::ProgramFinished(false) },
             [b'1', ..] => Match::Complete { len: 1, reply: Reply::ProgramFinished(true) },
@@ -389,7 +389,7 @@ fn match_error(bytes: &[u8]) -> Match<'_> {
     }
 }
 
-/// Which word of `text` is the first that names the command; `None` if none does.
+/// Index of the first word in `text` that names the command.
 pub(super) fn named_at(keyword: Keyword, text: &[u8]) -> Option<usize> {
     let is_name = |word: &[u8]| {
         word.eq_ignore_ascii_case(keyword.word().as_bytes())
@@ -398,8 +398,7 @@ pub(super) fn named_at(keyword: Keyword, text: &[u8]) -> Option<usize> {
     words(text).position(is_name)
 }
 
-/// The failure that a text in words of its own reports to `keyword`; `None` if it reports none. Values
-/// have no failure.
+/// The failure of `keyword` that an unknown text reports; `None` if it reports none. Queries have no failure.
 pub(super) fn failure<'a>(keyword: Keyword, text: &[u8]) -> Option<Reply<'a>> {
     let is_failure = |word: &[u8]| FAILURES.iter().any(|failure| word.eq_ignore_ascii_case(failure));
     named_at(keyword, text)?;
@@ -416,11 +415,11 @@ fn words(text: &[u8]) -> impl Iterator<Item = &[u8]> {
     text.split(|byte| !byte.is_ascii_alphanumeric())
 }
 
-/// How `bytes` compare with `text`.
+/// How `bytes` match a text.
 enum Front<'a> {
-    /// They begin with the whole text; this is the rest.
+    /// They begin with the text; the rest follows.
     Whole(&'a [u8]),
-    /// They are the beginning of the text.
+    /// They are a prefix of the text.
     Beginning,
     /// Neither.
     Other,
@@ -446,9 +445,9 @@ const SET_SPEED: &str = "set speed ";
 const UNKNOWN_COMMAND: &str = "unknown command";
 pub(super) const SCRIPT_FINISH: &str = "script finish";
 
-/// What replies to `speed` call it.
+/// The name of `speed` in its replies.
 const SET: &[u8] = b"set";
-/// Words of a failure.
+/// Words that report a failure.
 const FAILURES: [&[u8]; 3] = [b"fail", b"failed", b"error"];
 
 /// Longest number in `set speed V%`.

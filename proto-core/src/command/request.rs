@@ -1,7 +1,7 @@
 //! The client's requests (docs/wire/command.md section 2).
 //!
-//! In: the text of one command, found by [`CommandServer`](super::CommandServer) or taken from a
-//! command table. Out: a [`Request`]. And back, in a [`Dialect`]'s form.
+//! In: the text of one command, from [`CommandServer`](super::CommandServer) or a command table. Out: a [`Request`].
+//! And back, in a [`Dialect`]'s form.
 
 use core::fmt;
 
@@ -17,14 +17,14 @@ use crate::wire::dialect::{Dialect, Parentheses, Quotes};
 pub enum Request<'a> {
     /// `run(NAME)` or `run(NAME,SPEED)`.
     Run {
-        /// The program's name as written, without quotes (D3). May be empty when received.
+        /// The program's name as written, without quotes (D3). May be empty if received.
         program: &'a str,
-        /// The speed; `None` if it was absent or invalid: the current speed is used.
+        /// `None` if the speed was absent or invalid: the current speed is used.
         speed: Option<Percent>,
     },
-    /// `speed(V)`; `None` if V was not a valid speed: the controller refuses it.
+    /// `speed(V)`; `None` if V was not a valid speed, which the controller refuses.
     Speed(Option<Percent>),
-    /// A keyword for an action; the reply is its result.
+    /// A keyword for an action; the reply reports success or failure.
     Do(Action),
     /// `state`
     State,
@@ -103,7 +103,7 @@ pub enum Keyword {
 }
 
 impl Keyword {
-    /// Every keyword. None is the beginning of another, so a complete one is never ambiguous.
+    /// All keywords. None is a prefix of another, so a complete one is never ambiguous.
     pub const ALL: [Self; 13] = [
         Self::Run,
         Self::Speed,
@@ -132,12 +132,12 @@ impl Keyword {
         }
     }
 
-    /// Whether the command is urgent: it stops or switches off, and goes ahead of all others (D26).
+    /// Whether the command is urgent: it stops or switches off, and precedes all others (D26).
     pub const fn is_urgent(self) -> bool {
         matches!(self, Self::Do(Action::Stop | Action::Pause | Action::Disable | Action::PowerOff))
     }
 
-    /// Whether the command is the keyword alone.
+    /// Whether the command has no arguments.
     pub(crate) const fn is_bare(self) -> bool {
         !matches!(self, Self::Run | Self::Speed)
     }
@@ -165,9 +165,9 @@ pub enum ParseError {
         /// Offset of the first byte that is not UTF-8.
         at: usize,
     },
-    /// It does not begin with a keyword.
+    /// The first word is not a keyword.
     UnknownWord,
-    /// The parentheses do not close at the end, or open twice.
+    /// The parentheses are not closed at the end, or opened twice.
     Parentheses,
     /// `run` or `speed` without an argument.
     MissingArgument {
@@ -179,9 +179,9 @@ pub enum ParseError {
         /// The keyword.
         keyword: Keyword,
     },
-    /// A speed outside (0, 100], or not a number; reported only by [`Request::parse_strict`].
+    /// A speed that is not a number in (0, 100]; only from [`Request::parse_strict`].
     InvalidSpeed,
-    /// A program without a name; reported only by [`Request::parse_strict`].
+    /// A program without a name; only from [`Request::parse_strict`].
     NoProgram,
 }
 
@@ -225,7 +225,7 @@ pub enum EncodeError {
     },
     /// The program's name is empty, or begins or ends with a blank.
     ProgramName,
-    /// The program's name contains a byte that would end the name or the command.
+    /// The program's name contains a byte that ends the name or the command.
     ProgramByte {
         /// The first such byte.
         byte: u8,
@@ -257,10 +257,10 @@ impl From<NoTextSpace> for EncodeError {
 }
 
 impl<'a> Request<'a> {
-    /// Reads one command as a controller does: an invalid speed counts as absent.
+    /// Parses a command as a controller does: an invalid speed counts as absent.
     ///
     /// # Errors
-    /// [`ParseError`] for everything that is answered with `unknown command`.
+    /// [`ParseError`] for all texts that are answered with `unknown command`.
     pub fn parse(text: &'a [u8]) -> Result<Self, ParseError> {
         let (keyword, argument) = split(text)?;
         match keyword {
@@ -286,8 +286,8 @@ impl<'a> Request<'a> {
         }
     }
 
-    /// Reads one command that we are going to send: same as [`Request::parse`], but an invalid
-    /// speed or a missing program name is refused instead of left to the controller.
+    /// Parses a command to be sent: like [`Request::parse`], but refuses an invalid speed or a missing program name
+    /// instead of leaving this to the controller.
     ///
     /// # Errors
     /// [`ParseError`].
@@ -301,7 +301,7 @@ impl<'a> Request<'a> {
         }
     }
 
-    /// The first word of the command.
+    /// The keyword of the command.
     pub const fn keyword(&self) -> Keyword {
         match self {
             Self::Run { .. } => Keyword::Run,
@@ -313,8 +313,7 @@ impl<'a> Request<'a> {
         }
     }
 
-    /// Writes the command, with the dialect's terminator, to the front of `out` and returns its
-    /// length.
+    /// Writes the command, with the dialect's terminator, to the front of `out` and returns its length.
     ///
     /// # Errors
     /// [`EncodeError`] if the request cannot be encoded, or `out` is too short.
@@ -357,7 +356,7 @@ impl<'a> Request<'a> {
     }
 }
 
-/// Whether more bytes can still make `text` (no leading blanks) a command.
+/// Whether more bytes can make `text` (without leading blanks) a command.
 pub(super) fn may_become_command(text: &[u8]) -> bool {
     let room = MAX_COMMAND.saturating_sub(text.len());
     Keyword::ALL.into_iter().any(|keyword| {
@@ -365,7 +364,7 @@ pub(super) fn may_become_command(text: &[u8]) -> bool {
         match text.strip_prefix(word) {
             Some(rest) => match trim_start(rest).split_first() {
                 None => room >= 2,
-                // A bare keyword with an argument is not a command.
+                // A keyword without arguments, followed by an argument, is not a command.
                 Some((b'(', argument)) if keyword.is_bare() => room >= 1 && trim(argument).is_empty(),
                 Some((b'(', argument)) => room >= 1 && may_become_argument(argument),
                 Some(_) => false,
@@ -375,7 +374,7 @@ pub(super) fn may_become_command(text: &[u8]) -> bool {
     })
 }
 
-/// No second parenthesis, and UTF-8 whose last character may be cut.
+/// Whether there is no second parenthesis, and valid UTF-8 except for an incomplete last character.
 fn may_become_argument(argument: &[u8]) -> bool {
     let readable = core::str::from_utf8(argument).map_or_else(|error| error.error_len().is_none(), |_| true);
     readable && !argument.contains(&b'(')
@@ -405,7 +404,7 @@ fn split(text: &[u8]) -> Result<(Keyword, Option<&str>), ParseError> {
     Ok((keyword, argument))
 }
 
-/// `name` without a pair of double quotes around it (D3).
+/// `name` without double quotes around it (D3).
 fn unquoted(name: &str) -> &str {
     name.strip_prefix('"').and_then(|name| name.strip_suffix('"')).unwrap_or(name)
 }

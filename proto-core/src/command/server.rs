@@ -1,8 +1,8 @@
-//! The controller's side of a port-2000 connection: where one command ends and the next begins
-//! (docs/wire/command.md section 5).
+//! The controller's side of a port-2000 connection: where one command ends and the next begins (docs/wire/command.md
+//! section 5).
 //!
-//! In: received bytes and the time. Out: requests, and texts that must be answered with `unknown
-//! command`. Does not carry out anything.
+//! In: received bytes and the time. Out: requests, and texts to be answered with `unknown command`. Does not execute
+//! anything.
 
 use super::MAX_COMMAND;
 use super::request::{Keyword, Request, may_become_command};
@@ -11,27 +11,26 @@ use crate::time::{Duration, Instant};
 
 /// Splits one connection's bytes into commands.
 ///
-/// Call [`receive`](Self::receive) with each piece until it returns `None`; call
-/// [`poll`](Self::poll) until `None` when [`deadline`](Self::deadline) has come. Polling early is
-/// harmless.
+/// Call [`receive`](Self::receive) with each piece until it returns `None`; when [`deadline`](Self::deadline) is
+/// reached, call [`poll`](Self::poll) until it returns `None`. Polling early is harmless.
 #[derive(Debug, Clone)]
 pub struct CommandServer {
-    /// A bare keyword is complete after this much silence: 20 ms (D2).
+    /// A keyword without arguments is complete after this much silence: 20 ms (D2).
     pub keyword_gap: Duration,
-    /// After this much silence the rest of an overlong command is no longer dropped, and a text
-    /// that no further byte can make a command is given up: 100 ms (D5).
+    /// After this much silence the dropping of an overlong command ends, and a text that can no longer become a command
+    /// is given up: 100 ms (D5).
     pub drop_gap: Duration,
-    /// The beginning of a command is given up after this much silence: 10 s.
+    /// An incomplete command is given up after this much silence: 10 s.
     pub beginning_gap: Duration,
     buffer: [u8; MAX_COMMAND],
     len: usize,
-    /// The buffer holds a command that was returned; it is removed by the next call.
+    /// The buffer holds a command that was returned; the next call removes it.
     handed_out: bool,
-    /// After an overlong command, until its end.
+    /// Dropping the rest of an overlong command.
     dropping: bool,
-    /// The previous command was ended by silence: its empty parentheses may still be on the way.
+    /// Silence ended the previous command: its empty parentheses may still follow.
     ended_by_gap: bool,
-    /// When the newest byte came.
+    /// When the newest byte arrived.
     newest: Instant,
 }
 
@@ -44,12 +43,12 @@ pub enum ServerEvent<'a> {
     Unknown(UnknownCommand<'a>),
 }
 
-/// A text that is answered with `unknown command`.
+/// A text to be answered with `unknown command`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnknownCommand<'a> {
     /// A text that is not a command.
     Text(&'a [u8]),
-    /// More than [`MAX_COMMAND`] bytes without an end; what follows is dropped.
+    /// More than [`MAX_COMMAND`] bytes without an end; the rest is dropped.
     TooLong,
 }
 
@@ -69,8 +68,8 @@ impl CommandServer {
         }
     }
 
-    /// Takes bytes from the front of `bytes` until a command is complete. `None` means that all of
-    /// them were taken and no command is complete.
+    /// Takes bytes from the front of `bytes` until a command is complete. `None` if all are taken and no command is
+    /// complete.
     pub fn receive(&mut self, now: Instant, bytes: &mut &[u8]) -> Option<ServerEvent<'_>> {
         if self.handed_out {
             self.handed_out = false;
@@ -89,17 +88,17 @@ impl CommandServer {
         }
     }
 
-    /// The command that silence has completed by `now`.
+    /// Returns a command that silence has completed by `now`.
     pub fn poll(&mut self, now: Instant) -> Option<ServerEvent<'_>> {
         self.receive(now, &mut &[][..])
     }
 
-    /// When silence completes what was received, if it does.
+    /// When silence completes the received bytes, if it does.
     pub fn deadline(&self) -> Option<Instant> {
         Some(self.newest + self.gap()?)
     }
 
-    /// Forgets everything received, for a new connection.
+    /// Drops all received bytes, for a new connection.
     pub fn reset(&mut self) {
         let Self { keyword_gap, drop_gap, beginning_gap, .. } = *self;
         *self = Self { keyword_gap, drop_gap, beginning_gap, ..Self::new() };
@@ -151,7 +150,7 @@ impl CommandServer {
         StepEnd::Command
     }
 
-    /// The silence that would end the text in the buffer.
+    /// The silence that ends the text in the buffer.
     fn gap(&self) -> Option<Duration> {
         if self.dropping {
             return Some(self.drop_gap);

@@ -1,8 +1,8 @@
-//! Writing text into a caller's buffer, and the byte classes of the texts.
+//! Text output into a caller's buffer, and the character classes of texts.
 
 use core::fmt;
 
-/// The buffer was too small; its content is not useful.
+/// The buffer was too short; its content is undefined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
@@ -21,7 +21,7 @@ impl fmt::Display for NoTextSpace {
 
 impl core::error::Error for NoTextSpace {}
 
-/// Appends to a byte slice, and continues to count when the slice is full.
+/// Appends to a byte slice; continues to count if the slice is full.
 pub(super) struct CountingWriter<'a> {
     out: &'a mut [u8],
     len: usize,
@@ -75,7 +75,7 @@ pub(super) const fn is_terminator(byte: u8) -> bool {
     matches!(byte, b'\r' | b'\n' | 0)
 }
 
-/// Blanks and terminators: what may surround a text.
+/// Blanks and terminators, which may surround a text.
 pub(super) const fn is_blank(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t') || is_terminator(byte)
 }
@@ -91,7 +91,7 @@ pub(super) fn trim(text: &[u8]) -> &[u8] {
     text
 }
 
-/// `text` without blanks and terminators before it.
+/// `text` without leading blanks and terminators.
 pub(super) fn trim_start(mut text: &[u8]) -> &[u8] {
     while let Some((&first, rest)) = text.split_first()
         && is_blank(first)
@@ -101,7 +101,7 @@ pub(super) fn trim_start(mut text: &[u8]) -> &[u8] {
     text
 }
 
-/// Text without blanks and terminators at both ends; other white space belongs to a name.
+/// `text` without blanks and terminators at both ends; other white space belongs to a name.
 pub(super) fn trim_str(text: &str) -> &str {
     text.trim_matches(|letter: char| letter.is_ascii() && is_blank(letter as u8))
 }

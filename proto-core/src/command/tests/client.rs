@@ -221,7 +221,7 @@ fn what_is_so_already_is_done() {
             assert!(!client.busy());
         }
     }
-    // The reply to another command ends none.
+    // The reply to another command does not end the request.
     let mut client = asking("poweron");
     assert_eq!(
         receive(&mut client, at(1), b"already poweroffalready enable"),
@@ -302,7 +302,7 @@ fn other_words_belong_to_the_request_that_they_name_or_to_the_oldest_without_any
         ["Fail error: stop before resume"]
     );
     assert!(client.busy() && !client.busy_beside(), "the first that it names");
-    // It was on its way before the stop.
+    // Sent by the controller before it received the stop.
     let mut client = asking("resume");
     assert!(receive(&mut client, at(4), b"stop error").is_empty());
     client.start_beside(at(5), b"stop", &Dialect::V2_3, &mut [0; 16]).unwrap();

@@ -38,7 +38,7 @@ fn poll(server: &mut CommandServer, now: Instant) -> Vec<String> {
     receive(server, now, &[])
 }
 
-/// Everything `bytes` mean when they come at once, followed by a long silence.
+/// The events for `bytes` that arrive at once, followed by a long silence.
 fn whole(bytes: &[u8]) -> Vec<String> {
     let mut server = CommandServer::new();
     let mut events = receive(&mut server, at(0), bytes);
@@ -144,7 +144,7 @@ fn a_text_that_cannot_become_a_command_is_given_up_after_100_ms() {
     assert_eq!(server.deadline(), Some(at(100)));
     assert!(poll(&mut server, at(99)).is_empty());
     assert_eq!(poll(&mut server, at(100)), ["?dance"]);
-    // Two keywords glued together are not two commands: the second came within the gap.
+    // Two adjacent keywords are not two commands: the second arrived within the gap.
     assert!(receive(&mut server, at(200), b"state").is_empty());
     assert!(receive(&mut server, at(219), b"stop").is_empty());
     assert_eq!(poll(&mut server, at(319)), ["?statestop"]);
@@ -159,7 +159,7 @@ fn a_text_that_cannot_become_a_command_is_given_up_after_100_ms() {
 fn silence_counts_even_if_the_next_byte_is_seen_first() {
     let mut server = CommandServer::new();
     assert!(receive(&mut server, at(0), b"state").is_empty());
-    // The driver was late: it brings bytes before it polled.
+    // The driver was late: it passes bytes before it polls.
     assert_eq!(receive(&mut server, at(30), b"stop\n"), ["state", "stop"]);
 }
 
@@ -192,7 +192,7 @@ fn beginnings_that_no_byte_can_complete_are_not_waited_for() {
 #[test]
 fn a_beginning_is_given_up_after_ten_seconds_of_silence() {
     let mut server = CommandServer::new();
-    // A byte a second is a command that takes its time.
+    // One byte per second still makes a command.
     let mut time = 0;
     for byte in b"run(a.jspf,50" {
         assert!(receive(&mut server, at(time), &[*byte]).is_empty());
@@ -203,7 +203,7 @@ fn a_beginning_is_given_up_after_ten_seconds_of_silence() {
     assert!(poll(&mut server, at(29_999)).is_empty());
     assert_eq!(poll(&mut server, at(30_000)), ["?run(a.jspf"]);
     assert_eq!(receive(&mut server, at(30_001), b"stop\n"), ["stop"]);
-    // Nobody looked in between.
+    // Nobody polled in between.
     assert!(receive(&mut server, at(40_000), b"run(a.jspf").is_empty());
     assert_eq!(receive(&mut server, at(50_000), b"stop\n"), ["?run(a.jspf", "stop"]);
 }
@@ -266,7 +266,7 @@ fn events_carry_typed_requests() {
     assert_eq!(event, Some(ServerEvent::Request(Request::Speed(Percent::new(25.0)))));
 }
 
-/// Pieces of conversations, good and bad.
+/// Fragments of valid and invalid sessions.
 fn conversation() -> impl Strategy<Value = Vec<u8>> {
     let piece = prop_oneof![
         prop::sample::select(Keyword::ALL.to_vec()).prop_map(|keyword| keyword.word().as_bytes().to_vec()),

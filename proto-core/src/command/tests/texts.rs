@@ -167,7 +167,7 @@ proptest! {
                 let mut out = [0xA5; 300];
                 let len = reply.encode(&dialect, &mut out).unwrap();
                 let expected = match reply {
-                    // This dialect's text does not say the speed.
+                    // The reply does not contain the speed in this dialect.
                     Reply::SpeedSet(_) if dialect == Dialect::V2_3 => Reply::SpeedSet(None),
                     other => *other,
                 };
