@@ -1,11 +1,11 @@
-//! Sets of single bits of the byte inputs: those that a device drives, those still to be written.
+//! Sets of single bits of byte inputs, such as those that a device writes or those still to be sent.
 
 use super::InputSet;
 use crate::sysvar::{BIT_INPUT_COUNT, SysVar};
 
 const _: () = assert!(BIT_INPUT_COUNT * 8 <= 128);
 
-/// A set of bits of byte inputs, or the values of all of them. Other variables have no bits in it.
+/// A set of bits of byte inputs, or the values of all of them. Other variables are ignored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct BitSet(u128);
 
@@ -26,12 +26,12 @@ impl BitSet {
         vars.iter().fold(Self::EMPTY, |all, var| all.or(Self::of(var, u8::MAX)))
     }
 
-    /// The bits of one variable that are in the set, or its value.
+    /// The variable's bits that are in the set, or its value.
     pub(crate) fn byte(self, var: SysVar) -> u8 {
         place(var).map_or(0, |place| self.0.wrapping_shr(place) as u8)
     }
 
-    /// The values with some of a variable's bits replaced.
+    /// The set with the bits in `mask` of a variable replaced by those of `value`.
     #[must_use]
     pub(crate) fn with(self, var: SysVar, mask: u8, value: u8) -> Self {
         self.minus(Self::of(var, mask)).or(Self::of(var, mask & value))
@@ -55,13 +55,12 @@ impl BitSet {
         Self(self.0 & !other.0)
     }
 
-    /// Whether nothing is in the set.
     pub(crate) const fn is_empty(self) -> bool {
         self.0 == 0
     }
 }
 
-/// Byte inputs come first in the table.
+/// Position of the variable's lowest bit. Byte inputs come first in the table.
 fn place(var: SysVar) -> Option<u32> {
     (var.ordinal() < BIT_INPUT_COUNT).then(|| var.ordinal().wrapping_mul(8) as u32)
 }

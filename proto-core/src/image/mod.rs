@@ -1,9 +1,8 @@
-//! The process image: the value, source and age of every system variable
-//! (docs/engine.md section 3).
+//! The process image: value, source and age of every system variable (docs/engine.md section 3).
 //!
-//! Values are packed little-endian in one byte array, in the order of the variable table, so that
-//! neighbouring fields of a recipe are one copy. A variable has the age of its group: the
-//! frame, poll or packet that brings it. The image does not know recipes, ports or links.
+//! Values are packed little-endian in one byte array, in the order of the variable table, so that adjacent fields of a
+//! recipe are one copy. A variable has the age of its group: of the frame, poll or packet that brings it. Does not know
+//! recipes, ports or links.
 
 mod bit_set;
 mod set;
@@ -15,46 +14,47 @@ use crate::sysvar::{COUNT, IMAGE_BYTES, SysVar};
 use crate::time::{Duration, Instant, Stamp};
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// The values alone.
+/// The packed values.
 pub(crate) type ImageBytes = [u8; IMAGE_BYTES];
 
 /// Maximum number of groups of variables that arrive together.
 pub(crate) const MAX_GROUPS: usize = 96;
 
-/// Number of groups of fields that were rejected while the rest of their frame was accepted. Their ids follow those
-/// above.
+/// Maximum number of fields that can be rejected at a time while the rest of their frame is accepted; each gets a group
+/// of its own. Their ids follow the other groups'.
 pub(crate) const WITHHELD_GROUPS: usize = 14;
 
-/// Maximum number of values beside the system variables that ports show.
+/// Maximum number of extra values that ports show, besides the system variables.
 pub(crate) const MAX_EXTRA: usize = 32;
 
-/// A group of variables that arrive together and so have one age: a field frame, a Modbus block, a
+/// A group of variables that arrive together and therefore have the same age: a field frame, a Modbus block or a
 /// packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub(crate) struct GroupId(pub(crate) u8);
 
-/// Every system variable with value, source and age.
+/// Value, source and age of every system variable.
 #[derive(Debug, Clone)]
 pub struct Image {
     bytes: ImageBytes,
-    /// One more than the number of the group; 0 for a variable without a group.
+    /// Number of the group + 1; 0 for a variable without a group.
     group: [u8; COUNT],
     /// When each group last arrived; [`Instant::NEVER`] before the first time.
     stamps: [Stamp; MAX_GROUPS + WITHHELD_GROUPS],
-    /// Variables whose field was rejected in the newest frame of their owner: they have a group of their own meanwhile.
+    /// Variables whose field was rejected in the newest frame of their owner; until accepted, they have a group of
+    /// their own.
     withheld: InputSet,
-    /// Variables whose newest value could not be read, whatever else their group brought.
+    /// Variables whose newest value was unreadable, even if others of their group were readable.
     unreadable: VarSet,
-    /// Whether there are any of these two kinds, among the extra values too.
+    /// Whether `withheld`, `unreadable` or `unreadable_extra` may have entries.
     any_unreadable: bool,
-    /// Values beside the system variables that ports show, and which of them are unreadable.
+    /// Extra values that ports show besides the system variables, and which of them are unreadable.
     extra: [f64; MAX_EXTRA],
     unreadable_extra: ExtraSet,
 }
 
 impl Image {
-    /// All zeros, and all unknown.
+    /// An image with all values zero and unknown.
     pub(crate) const fn new() -> Self {
         Self {
             bytes: [0; IMAGE_BYTES],
@@ -73,12 +73,12 @@ impl Image {
         &self.bytes
     }
 
-    /// The packed values, mutable, for a recipe or packet whose layout fits them.
+    /// The packed values, to be written by a recipe or packet with a matching layout.
     pub(crate) fn bytes_mut(&mut self) -> &mut ImageBytes {
         &mut self.bytes
     }
 
-    /// The variable's value; only meaningful when [`Self::is_known`].
+    /// The variable's value; only valid if [`Self::is_known`].
     pub fn value(&self, var: SysVar) -> Scalar {
         let start = var.image_offset();
         let bytes = self.bytes.get(start..start.saturating_add(var.size())).unwrap_or(&[]);
@@ -103,31 +103,31 @@ impl Image {
         Ok(())
     }
 
-    /// The value of a byte variable, known or not.
+    /// The value of a byte variable, even if unknown.
     pub(crate) fn byte(&self, var: SysVar) -> u8 {
         self.bytes.get(var.image_offset()).copied().unwrap_or(0)
     }
 
-    /// A bit of a byte variable, 0 or 1, known or not.
+    /// A bit of a byte variable, 0 or 1, even if unknown.
     pub(crate) fn bit(&self, var: SysVar, bit: u8) -> f64 {
         f64::from(self.byte(var).checked_shr(bit.into()).unwrap_or(0) & 1)
     }
 
-    /// Sets some bits of a byte variable.
+    /// Sets the bits in `mask` of a byte variable.
     pub(crate) fn set_bits(&mut self, var: SysVar, mask: u8, value: u8) {
         if let Some(byte) = self.bytes.get_mut(var.image_offset()).filter(|_| var.is_bits()) {
             *byte = *byte & !mask | value & mask;
         }
     }
 
-    /// Assigns the variable to the group that it arrives with.
+    /// Assigns the variable to the group in which it arrives.
     pub(crate) fn assign(&mut self, var: SysVar, group: GroupId) {
         if let Some(slot) = self.group.get_mut(var.ordinal()) {
             *slot = group.0.saturating_add(1);
         }
     }
 
-    /// The group that the variable arrives with.
+    /// The group in which the variable arrives.
     pub(crate) fn group(&self, var: SysVar) -> Option<GroupId> {
         self.group.get(var.ordinal()).and_then(|slot| slot.checked_sub(1)).map(GroupId)
     }
@@ -144,8 +144,8 @@ impl Image {
         self.stamps.get(usize::from(group.0)).filter(|&&at| at != Stamp::NEVER).map(|at| at.get())
     }
 
-    /// Sets the variable to the value that its source just sent; an unreadable value makes the
-    /// variable unknown until a readable one comes. Returns whether the value was readable.
+    /// Sets the variable to a value from its source. An unreadable value makes the variable unknown until a readable
+    /// one arrives. Returns whether the value was readable.
     pub(crate) fn receive(&mut self, var: SysVar, value: Scalar) -> bool {
         let readable = self.set(var, value).is_ok();
         if !readable || self.any_unreadable {
@@ -163,7 +163,7 @@ impl Image {
         }
     }
 
-    /// Records that everything that the sources of these variables just sent was readable.
+    /// Records that the newest values of all these variables were readable.
     pub(crate) fn all_readable(&mut self, vars: impl Iterator<Item = SysVar>) {
         if self.any_unreadable {
             vars.for_each(|var| self.unreadable.remove(var));
@@ -177,47 +177,47 @@ impl Image {
             || !self.withheld.is_empty();
     }
 
-    /// The variables that have the age of their own newest value, and not that of their owner's frame.
+    /// The variables that have the age of their own newest value instead of their owner's frame.
     pub(crate) fn withheld(&self) -> InputSet {
         self.withheld
     }
 
-    /// The variable's field was rejected: it has the age of this group until it is back.
+    /// The variable's field was rejected: until it is accepted again, the variable has the age of this group.
     pub(crate) fn withhold(&mut self, var: SysVar, group: GroupId) {
         self.assign(var, group);
         self.withheld.insert(var);
         self.any_unreadable = true;
     }
 
-    /// The variable's field is accepted again: it has the age of this group, its frame's.
+    /// The variable's field is accepted again: the variable has the age of its frame's group.
     pub(crate) fn readmit(&mut self, var: SysVar, frame: GroupId) {
         self.assign(var, frame);
         self.withheld.remove(var);
         self.note_unreadable();
     }
 
-    /// Whether any variable's or extra value's newest value was not readable, or was rejected.
+    /// Whether the newest value of any variable or extra value was unreadable or rejected.
     pub(crate) fn has_unreadable(&self) -> bool {
         self.any_unreadable
     }
 
-    /// Whether the variable's newest value was readable, if there was one.
+    /// Whether the variable's newest value was readable; true if there was none.
     pub(crate) fn is_readable(&self, var: SysVar) -> bool {
         !self.unreadable.contains(var)
     }
 
-    /// Whether the newest values of all these variables, and of these extra values, were readable.
+    /// Whether the newest values of all these variables and extra values were readable.
     pub(crate) fn can_read(&self, vars: &VarSet, extra: ExtraSet) -> bool {
         !self.any_unreadable || !self.unreadable.meets(vars) && !self.unreadable_extra.meets(extra)
     }
 
-    /// The value in this place for extra values.
+    /// The extra value with this number.
     pub(crate) fn extra(&self, nth: u8) -> f64 {
         self.extra.get(usize::from(nth)).copied().unwrap_or(f64::NAN)
     }
 
-    /// Sets an extra value; one that is not finite is unknown until a readable one comes. Returns
-    /// whether it was readable.
+    /// Sets an extra value. A value that is not finite makes it unknown until a finite one arrives. Returns whether the
+    /// value was finite.
     pub(crate) fn receive_extra(&mut self, nth: u8, value: f64) -> bool {
         let readable = value.is_finite();
         if let Some(place) = self.extra.get_mut(usize::from(nth))
@@ -234,17 +234,17 @@ impl Image {
         readable
     }
 
-    /// The age of the variable's value; `None` if it never arrived or was unreadable.
+    /// Age of the variable's value; `None` if no value has arrived or the newest was unreadable.
     pub fn age(&self, var: SysVar, now: Instant) -> Option<Duration> {
         self.known_since(var).map(|at| now.saturating_since(at))
     }
 
-    /// Whether the variable's value ever arrived, and the newest one was readable.
+    /// Whether a value has arrived for the variable and the newest was readable.
     pub fn is_known(&self, var: SysVar) -> bool {
         self.known_since(var).is_some()
     }
 
-    /// When the variable's value arrived; `None` if it never did or was unreadable.
+    /// When the variable's value arrived; `None` if no value has arrived or the newest was unreadable.
     pub(crate) fn known_since(&self, var: SysVar) -> Option<Instant> {
         self.group(var).and_then(|group| self.stamp_of(group)).filter(|_| !self.unreadable.contains(var))
     }
@@ -268,10 +268,10 @@ impl core::fmt::Display for NotForVariable {
 
 impl core::error::Error for NotForVariable {}
 
-/// `raw * scale + offset` as a value of `var`: the binding of a user-defined input field.
+/// Applies the binding of a user-defined input field: `raw * scale + offset` as a value of `var`.
 ///
-/// Integers are rounded to the nearest, halves away from zero. `None` if the result is not finite
-/// or out of the variable's range: such a frame is rejected (D22).
+/// Integers are rounded to the nearest, halves away from zero. `None` if the result is not finite or out of the
+/// variable's range: such a frame is rejected (D22).
 pub(crate) fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32) -> Option<Scalar> {
     let value = raw.as_f64() * f64::from(scale) + f64::from(offset);
     let value = if var.ty() == ScalarType::Float { value } else { round(value) };
@@ -282,8 +282,8 @@ pub(crate) fn bind_to_variable(var: SysVar, raw: Scalar, scale: f32, offset: f32
     }
 }
 
-/// `value * scale + offset` as a field of type `ty`: the binding of a user-defined output field.
-/// Rounded like an input, and saturated at the type's range. Not a number becomes 0.
+/// Applies the binding of a user-defined output field: `value * scale + offset` as type `ty`. Rounded like an input,
+/// and saturated at the type's range. NaN becomes 0.
 pub(crate) fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: f32) -> Scalar {
     let value = value * f64::from(scale) + f64::from(offset);
     let value = match ty {
@@ -291,7 +291,7 @@ pub(crate) fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: 
         _ => round(value),
     };
     let (low, high) = ty.range();
-    // `clamp` panics if `low` is above `high`.
+    // `clamp` would panic if `low` were above `high`.
     let value = match value {
         _ if value.is_nan() => 0.0,
         _ if value < low => low,
@@ -301,9 +301,9 @@ pub(crate) fn saturate_to_field(ty: ScalarType, value: f64, scale: f32, offset: 
     Scalar::from_f64(ty, value).unwrap_or(Scalar::Byte(0))
 }
 
-/// To the nearest integer, halves away from zero; `core` has no `round`.
+/// Rounds to the nearest integer, halves away from zero; `core` has no `round`.
 pub(crate) fn round(value: f64) -> f64 {
-    // Beyond 2^52 every binary64 is an integer, and the cast below would saturate.
+    // Beyond 2^52 every binary64 is an integer, and the cast below could saturate.
     if !(-4.5e15..=4.5e15).contains(&value) {
         return value;
     }

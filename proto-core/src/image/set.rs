@@ -1,5 +1,4 @@
-//! Sets of variables, as bits: the variables of a frame, those still to be written, those that are
-//! unknown.
+//! Sets of variables as bits, such as the variables of a frame, those still to be written, or those that are unknown.
 
 use crate::sysvar::{BIT_INPUT_COUNT, COUNT, INPUT_COUNT, SysVar};
 
@@ -10,7 +9,7 @@ const _: () = assert!(INPUT_COUNT.div_ceil(32) == WORDS && BIT_INPUT_COUNT < 32)
 #[derive(Debug, Clone, Copy, Eq, Default)]
 pub(crate) struct InputSet([u32; WORDS]);
 
-/// Comparing arrays would be a call of `memcmp` on a Cortex-M.
+/// Comparing arrays would call `memcmp` on a Cortex-M.
 impl PartialEq for InputSet {
     fn eq(&self, other: &Self) -> bool {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
@@ -45,7 +44,6 @@ impl InputSet {
         ordinal < INPUT_COUNT && self.0.get(ordinal / 32).is_some_and(|word| word >> (ordinal % 32) & 1 == 1)
     }
 
-    /// Whether nothing is in the set.
     pub(crate) fn is_empty(&self) -> bool {
         let [a, b, c] = self.0;
         a | b | c == 0
@@ -78,24 +76,24 @@ impl InputSet {
         Self([a & !d, b & !e, c & !f])
     }
 
-    /// Number of consecutive variables in the table, from `first` on, that are all in the set.
+    /// Number of consecutive variables of the table, from `first` on, that are in the set.
     pub(crate) fn run_len(&self, first: SysVar) -> usize {
         let ordinal = first.ordinal();
-        // Most runs lie in one word; numbers of 128 bits are slow on a Cortex-M.
+        // Most runs are within one word; 128-bit numbers are slow on a Cortex-M.
         let (within, left) = ((ordinal % 32) as u32, 32_u32.wrapping_sub((ordinal % 32) as u32));
         let run = self.0.get(ordinal / 32).map_or(0, |word| (word >> within).trailing_ones());
         if run < left { run as usize } else { self.long_run_len(ordinal) }
     }
 
-    /// The same where the run may go on in the next word.
+    /// Like [`Self::run_len`], for a run that may continue in the next word.
     fn long_run_len(&self, ordinal: usize) -> usize {
         self.bits().checked_shr(ordinal as u32).map_or(0, |bits| bits.trailing_ones() as usize)
     }
 
-    /// The `len` variables from `first` on, without those that are not inputs.
+    /// The `len` variables from `first` on that are inputs.
     pub(crate) fn run(first: SysVar, len: usize) -> Self {
         let (nth, within) = (first.ordinal() / 32, first.ordinal() % 32);
-        // Most runs lie in one word.
+        // Most runs are within one word.
         if within.saturating_add(len) > 32 || first.ordinal().saturating_add(len) > INPUT_COUNT {
             return Self::long_run(first, len);
         }
@@ -104,13 +102,13 @@ impl InputSet {
         Self([of(0), of(1), of(2)])
     }
 
-    /// The same, wherever they are.
+    /// Like [`Self::run`], for any position.
     fn long_run(first: SysVar, len: usize) -> Self {
         let end = first.ordinal().saturating_add(len).min(INPUT_COUNT);
         Self::from(first.ordinal()).minus(&Self::from(end))
     }
 
-    /// Everything from this place of the table on, also behind the last input.
+    /// All bits from this position on, including those after the last input.
     fn from(start: usize) -> Self {
         let mut words = [u32::MAX; WORDS];
         for (nth, word) in words.iter_mut().enumerate() {
@@ -120,14 +118,14 @@ impl InputSet {
         Self(words)
     }
 
-    /// The first variable of the set at or behind this place of the table, or else the first of all.
+    /// The first variable of the set at or after this position of the table, or else the first of all.
     pub(crate) fn first_from(&self, ordinal: usize) -> Option<SysVar> {
-        // Mostly it is near.
+        // Usually it is in the same word.
         let behind = self.0.get(ordinal / 32).map_or(0, |word| word >> (ordinal % 32));
         if behind != 0 {
             return SysVar::from_ordinal(ordinal.saturating_add(behind.trailing_zeros() as usize));
         }
-        // The words behind that one, or else all.
+        // Searches the later words, then all.
         let [_, b, c] = self.0;
         match ordinal / 32 {
             0 if b | c != 0 => Self([0, b, c]).first(),
@@ -202,18 +200,17 @@ impl VarSet {
         self.0.get(var.ordinal() / 32).is_some_and(|word| word & bit_of(var) != 0)
     }
 
-    /// Whether nothing is in the set.
     pub(crate) fn is_empty(&self) -> bool {
         self.0.iter().all(|word| *word == 0)
     }
 
-    /// Those of these input variables that are in the set.
+    /// The variables that are both in `vars` and in this set.
     pub(crate) fn inputs(&self, vars: &InputSet) -> impl Iterator<Item = SysVar> + use<> {
         let own = *self;
         vars.iter().filter(move |&var| own.contains(var))
     }
 
-    /// Whether a variable is in both sets.
+    /// Whether the sets have a variable in common.
     pub(crate) fn meets(&self, other: &Self) -> bool {
         self.0.iter().zip(&other.0).any(|(one, other)| one & other != 0)
     }
@@ -235,7 +232,7 @@ impl ExtraSet {
         self.0 = if is_in { self.0 | bit } else { self.0 & !bit };
     }
 
-    /// Whether a value is in both sets.
+    /// Whether the sets have a value in common.
     pub(crate) fn meets(self, other: Self) -> bool {
         self.0 & other.0 != 0
     }
@@ -297,7 +294,7 @@ mod tests {
                 assert_eq!(run.run_len(first), len.min(INPUT_COUNT.saturating_sub(from)));
             }
         }
-        // Two variables, of one word and of two.
+        // Pairs of variables in the same word and in different words.
         for pair in [[0, 20], [0, 40], [5, 77], [31, 32], [33, 70], [63, 64], [65, 88]] {
             let two: InputSet = pair.into_iter().filter_map(SysVar::from_ordinal).collect();
             for from in 0..COUNT {
