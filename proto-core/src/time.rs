@@ -1,7 +1,6 @@
 //! Virtual time: instants and durations in whole microseconds.
 //!
-//! The core never reads a clock; its caller passes [`Instant`]s. Arithmetic saturates, so no
-//! instant makes the core panic.
+//! The core never reads a clock: callers pass [`Instant`]s. Arithmetic saturates and never panics.
 
 use core::fmt;
 use core::ops::{Add, AddAssign, Sub};
@@ -14,7 +13,7 @@ pub struct Instant(u64);
 impl Instant {
     /// The epoch.
     pub const ZERO: Self = Self(0);
-    /// A point that is never reached: "no deadline".
+    /// A time that is never reached: "no deadline".
     pub const NEVER: Self = Self(u64::MAX);
 
     /// The instant `micros` µs after the epoch.
@@ -32,13 +31,13 @@ impl Instant {
         self.0
     }
 
-    /// The time from `earlier` to `self`, zero when `earlier` is later.
+    /// The time from `earlier` to `self`; zero if `earlier` is later.
     pub const fn saturating_since(self, earlier: Self) -> Duration {
         Duration(self.0.saturating_sub(earlier.0))
     }
 }
 
-/// An instant that is all zeros for [`Instant::NEVER`]: instants that are not known yet take no flash.
+/// An instant with [`Instant::NEVER`] represented as zero, so that unset instants take no flash.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Stamp(u64);
 
@@ -53,7 +52,7 @@ impl Stamp {
         Instant(!self.0)
     }
 
-    /// This instant, if it is earlier.
+    /// Replaces this instant by an earlier one.
     pub(crate) const fn or_earlier(&mut self, instant: Instant) {
         if !instant.0 > self.0 {
             self.0 = !instant.0;
@@ -111,7 +110,7 @@ impl Duration {
 }
 
 impl From<core::time::Duration> for Duration {
-    /// In whole microseconds, rounded down; [`Duration::MAX`] where that is too long.
+    /// In whole microseconds, rounded down; saturates at [`Duration::MAX`].
     fn from(span: core::time::Duration) -> Self {
         Self(u64::try_from(span.as_micros()).unwrap_or(u64::MAX))
     }

@@ -1,7 +1,7 @@
-//! THE table of system variables; every other form of it is derived from it (docs/wire/sysvars.md).
+//! The table of system variables, from which everything about them is derived (docs/wire/sysvars.md).
 //!
-//! A [`SysVar`] is one variable, such as `RobotState[8]`. Its type, direction, unit, its place in
-//! the 2001 stream, its Modbus range and its place in the process image all come from [`SPANS`].
+//! A [`SysVar`] is one variable, such as `RobotState[8]`. Its type, direction, unit, and its places in the 2001 stream,
+//! the Modbus map and the process image all come from [`SPANS`].
 
 mod name;
 mod state;
@@ -12,7 +12,7 @@ pub use table::{SPANS, Span};
 
 use crate::wire::scalar::ScalarType;
 
-/// Which way a variable travels (docs/wire/sysvars.md sections 1 and 2).
+/// The direction of a variable (docs/wire/sysvars.md sections 1 and 2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Direction {
@@ -24,13 +24,12 @@ pub enum Direction {
 
 /// The place of a variable in the 1468-byte state packet of port 2001.
 ///
-/// A byte variable is eight bools there, one byte each, lowest number first; words and floats
-/// are there as they are.
+/// A byte variable occupies eight bools, one byte each, lowest number first. Words and floats are stored unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StreamPlace {
     /// Offset of the first byte in the packet.
     pub offset: u16,
-    /// Bytes the variable takes there: 8 for a byte variable, 2 for a word, 4 for a float.
+    /// Length in bytes: 8 for a byte variable, 2 for a word, 4 for a float.
     pub len: u16,
 }
 
@@ -44,13 +43,13 @@ pub enum ModbusPlace {
         /// 8, or 2 for the tool's inputs and outputs.
         count: u16,
     },
-    /// One holding register that is the value.
+    /// One holding register with the value.
     Register {
         /// The register's address.
         address: u16,
     },
-    /// One holding register that carries a float as `value * per_unit`, two's complement,
-    /// saturated at ±32767: coarser than every other source of the value.
+    /// One holding register with a float as `value * per_unit`, two's complement, saturated at ±32767. This is coarser
+    /// than every other source of the value.
     Scaled {
         /// The register's address.
         address: u16,
@@ -61,20 +60,20 @@ pub enum ModbusPlace {
 
 /// One system variable.
 ///
-/// Inputs come first, in the specification's order, then outputs; the order is that of the
-/// process image, so a run of consecutive variables of one kind is one run of bytes there.
+/// Inputs come first, in the specification's order, then outputs. The process image has the same order, so consecutive
+/// variables of one kind are consecutive bytes there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct SysVar(u8);
 
-/// Where a variable is.
+/// The places of a variable.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct VarPlace {
     /// In the Modbus map.
     pub modbus: Option<ModbusPlace>,
-    /// Number of variables from it to the last of its row.
+    /// Number of variables from this one to the last of its table row.
     pub left_in_row: usize,
-    /// In the process image.
+    /// Offset in the process image.
     pub image_offset: usize,
 }
 
@@ -82,7 +81,7 @@ pub(crate) struct VarPlace {
 pub const COUNT: usize = table::COUNT;
 /// Number of inputs; they have the lowest ordinals.
 pub(crate) const INPUT_COUNT: usize = table::INPUT_COUNT;
-/// Number of inputs that are byte variables; they have the lowest ordinals of all.
+/// Number of byte variables among the inputs; they have the lowest ordinals.
 pub(crate) const BIT_INPUT_COUNT: usize = table::BIT_INPUT_COUNT;
 /// Size of the process image: every variable packed in order.
 pub const IMAGE_BYTES: usize = table::IMAGE_BYTES;
@@ -146,32 +145,30 @@ impl SysVar {
         self.span().valid_bits
     }
 
-    /// Whether the variable's bits are eight (or two) separate items, whose edges matter.
+    /// Whether the variable consists of eight (or two) separate bits, whose edges matter.
     pub fn is_bits(self) -> bool {
         self.ty() == ScalarType::Byte
     }
 
-    /// The unit of a quantity, as in `m` or `rad`; empty for bits, counts and registers.
+    /// The unit, such as `m` or `rad`; empty for bits, counts and registers.
     pub fn unit(self) -> &'static str {
         self.span().unit
     }
 
-    /// The variable's place in the state packet; for an input, where its present value can be read
-    /// back.
+    /// The variable's place in the state packet. For an input, the output there shows its present value.
     pub fn stream(self) -> Option<StreamPlace> {
         let len = if self.is_bits() { 8 } else { self.size() } as u16;
         let first = self.span().stream?;
         Some(StreamPlace { offset: first.saturating_add(self.place_in_span().saturating_mul(len)), len })
     }
 
-    /// The output that shows the value of this input: the one at the same place in the state
-    /// packet.
+    /// The output that shows the value of this input: the one at the same place in the state packet.
     pub fn shown_by(self) -> Option<Self> {
         let place = self.stream().filter(|_| self.direction() == Direction::Input)?;
         Self::all().find(|var| var.direction() == Direction::Output && var.stream() == Some(place))
     }
 
-    /// Number of variables from this one to the last of its row.
+    /// Number of variables from this one to the last of its table row.
     pub(crate) fn left_in_row(self) -> usize {
         self.place().left_in_row
     }
@@ -181,10 +178,10 @@ impl SysVar {
         self.place().modbus
     }
 
-    /// Its places, looked up once.
+    /// All places, with one look-up.
     pub(crate) fn place(self) -> VarPlace {
         let (span, nth, image_offset) = table::place_of(self.ordinal());
-        // No address is near the end of 16 bits; a test looks at all of them.
+        // No address is near the end of 16 bits, which a test checks.
         let modbus = span.modbus.map(|place| match place {
             ModbusPlace::Coils { first, count } => {
                 ModbusPlace::Coils { first: first.wrapping_add(nth.wrapping_mul(count)), count }

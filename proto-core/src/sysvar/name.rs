@@ -118,8 +118,8 @@ impl SysVar {
 }
 
 impl VarRange {
-    /// The variables with this name: one (`RobotState[8]`, `__RobotState_8`) or a range
-    /// (`RobotState[8..13]`, both ends included).
+    /// The variables with this name: one (`RobotState[8]`, `__RobotState_8`) or a range (`RobotState[8..13]`,
+    /// inclusive).
     ///
     /// # Errors
     /// [`ParseError`] says what is wrong and what is allowed.
@@ -144,7 +144,7 @@ impl VarRange {
     }
 }
 
-/// One bit of a byte variable, as `BitInputReg[3].4` names it.
+/// One bit of a byte variable, named like `BitInputReg[3].4`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct VarBit {
     /// The variable; [`Self::mask`] says whether it has the bit.
@@ -154,20 +154,20 @@ pub struct VarBit {
 }
 
 impl VarBit {
-    /// The bit with this name: `BitInputReg[3].4` or `__BitInputReg_3.4`; `None` if no bit is named.
-    /// Whether the variable has the bit is not checked.
+    /// Parses a name such as `BitInputReg[3].4` or `__BitInputReg_3.4`; `None` if it names no bit. Does not check
+    /// whether the variable has the bit.
     ///
     /// # Errors
     /// [`ParseError`] says what is wrong with the variable's name.
     pub fn parse(name: &str) -> Option<Result<Self, ParseError>> {
         let (var, bit) = rsplit_once(name, b'.')?;
-        // The end of a range is not a bit: its bracket is still open.
+        // In `Group[1..2` the dot belongs to a range, whose bracket is still open.
         let bit = number(bit).ok().filter(|_| !bit.is_empty())?;
         let bit = u8::try_from(bit).unwrap_or(u8::MAX);
         Some(SysVar::parse(var).map(|var| Self { var, bit }))
     }
 
-    /// The bit in the variable's byte; `None` if the variable has no such bit.
+    /// Mask of the bit in the variable's byte; `None` if the variable has no such bit.
     pub fn mask(self) -> Option<u8> {
         let mask = 1_u8.checked_shl(self.bit.into())?;
         (self.var.is_bits() && self.var.valid_bits() & mask != 0).then_some(mask)

@@ -1,8 +1,8 @@
-//! The variables in the state packet of port 2001 (docs/wire/state.md section 5): one by one, or all
-//! outputs at once into the process image.
+//! The variables in the state packet of port 2001 (docs/wire/state.md section 5): read one by one, or all outputs at
+//! once into the process image.
 //!
-//! The variable table has every variable's place on both sides. Words and floats that are
-//! consecutive on both sides are copied at once.
+//! The variable table has the places on both sides. Words and floats that are adjacent on both sides are copied at
+//! once.
 
 mod places;
 
@@ -13,8 +13,8 @@ use crate::wire::scalar::Scalar;
 use crate::wire::state::StateView;
 
 impl StateView<'_> {
-    /// Writes every output variable that is in the packet (docs/wire/state.md section 5); the
-    /// others keep their values.
+    /// Writes every output variable in the packet to the image (docs/wire/state.md section 5); the others keep their
+    /// values.
     pub fn copy_to_image(&self, image: &mut [u8; IMAGE_BYTES]) {
         let bytes = self.as_bytes();
         for copy in COPIES {
@@ -32,11 +32,10 @@ impl StateView<'_> {
         }
     }
 
-    /// The value of a variable that is in the packet; for an input, its present value. `None` for a
-    /// variable that is not in the packet.
+    /// The value of a variable in the packet; for an input, its present value. `None` if the packet does not have the
+    /// variable.
     ///
-    /// A byte variable's bits are packed lowest first (D13) and masked (D22); a bool byte that is
-    /// not 0 counts as 1.
+    /// Bits of a byte variable are packed lowest first (D13) and masked (D22); a bool byte other than 0 counts as 1.
     pub fn read_var(&self, var: SysVar) -> Option<Scalar> {
         let place = var.stream()?;
         let bytes = self.as_bytes().get(usize::from(place.offset)..)?;
@@ -48,11 +47,10 @@ impl StateView<'_> {
     }
 }
 
-/// Eight bool bytes as one byte, the first in the least significant bit (D13); what is not 0
-/// counts as 1.
+/// Packs eight bool bytes into one byte, the first in the least significant bit (D13). Values other than 0 count as 1.
 fn pack(bools: &[u8; 8]) -> u8 {
     const LOW_SEVEN: u64 = 0x7F7F_7F7F_7F7F_7F7F;
-    // Places bit 0 of byte n at bit 56 + n; no two bits meet, so nothing carries.
+    // Moves bit 0 of byte n to bit 56 + n; the products do not overlap, so there are no carries.
     const GATHER: u64 = 0x0102_0408_1020_4080;
     let bytes = u64::from_le_bytes(*bools);
     let high = (bytes & LOW_SEVEN).wrapping_add(LOW_SEVEN) | bytes;

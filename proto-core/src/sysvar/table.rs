@@ -1,4 +1,4 @@
-//! The rows, and what is computed from them once, at compile time.
+//! The rows of the table, and values derived from them at compile time.
 #![allow(
     clippy::indexing_slicing,
     clippy::arithmetic_side_effects,
@@ -19,7 +19,7 @@ pub struct Span {
     pub last: u8,
     /// Type of each variable.
     pub ty: ScalarType,
-    /// What the robot connects it to.
+    /// The robot's interface that it is connected to.
     pub interface: &'static str,
     /// Unit of a quantity, or empty.
     pub unit: &'static str,
@@ -66,13 +66,13 @@ impl Span {
         (self.last as usize).wrapping_sub(self.first as usize).wrapping_add(1)
     }
 
-    /// No row is empty.
+    /// Always false.
     pub const fn is_empty(&self) -> bool {
         false
     }
 }
 
-/// Rows of [`SPANS`] that are inputs; they come first.
+/// Number of input rows in [`SPANS`]; they come first.
 const INPUT_ROWS: usize = 8;
 
 /// All system variables.
@@ -80,7 +80,7 @@ pub static SPANS: [Span; 25] = ROWS;
 
 #[rustfmt::skip]
 const ROWS: [Span; 25] = [
-    // Inputs, user to robot. `stream` is where the present value can be read back.
+    // Inputs, user to robot. `stream` is where the present value can be read.
     row("DigitalOutputCommand", 1, 2, Byte, "cabinet digital outputs DO1..16").stream(752).coils(192),
     row("DigitalOutputCommand", 3, 3, Byte, "tool digital outputs 1..2").stream(1416).tool_coils(216),
     row("BitInputReg", 1, 2, Byte, "functional bool register inputs 1..16").stream(1088).coils(0),
@@ -115,7 +115,7 @@ pub(super) const BIT_INPUT_COUNT: usize = count(bit_rows());
 pub(super) const IMAGE_BYTES: usize = bytes(ROWS.len());
 pub(super) const INPUT_BYTES: usize = bytes(INPUT_ROWS);
 
-/// Rows of byte variables at the beginning of the table; no other rows have byte inputs.
+/// Number of rows of byte inputs, which are at the beginning of the table.
 const fn bit_rows() -> usize {
     let mut rows = 0;
     while matches!(ROWS[rows].ty, Byte) {
@@ -147,7 +147,7 @@ const fn bytes(rows: usize) -> usize {
     sum
 }
 
-/// For each variable: its row, its place in the row, its offset in the image.
+/// For each variable: its row, its index in the row, its offset in the image.
 static PLACES: [(u8, u8, u16); COUNT] = {
     let mut places = [(0, 0, 0); COUNT];
     let (mut row, mut var, mut offset) = (0, 0, 0);
@@ -164,13 +164,13 @@ static PLACES: [(u8, u8, u16); COUNT] = {
     places
 };
 
-/// `ordinal` is below [`COUNT`] in every [`super::SysVar`]; anything else reads the first row.
+/// The row of a variable. `ordinal` is always below [`COUNT`]; other numbers give the first row.
 pub(super) fn span_of(ordinal: usize) -> &'static Span {
     let row = PLACES.get(ordinal).map_or(0, |place| usize::from(place.0));
     SPANS.get(row).unwrap_or(&SPANS[0])
 }
 
-/// The row, the place in it, and the offset in the image.
+/// The row, the index in it, and the offset in the image.
 pub(super) fn place_of(ordinal: usize) -> (&'static Span, u16, usize) {
     let (row, nth, offset) = PLACES.get(ordinal).copied().unwrap_or_default();
     (SPANS.get(usize::from(row)).unwrap_or(&SPANS[0]), nth.into(), offset.into())

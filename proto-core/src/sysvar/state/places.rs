@@ -1,4 +1,4 @@
-//! What is copied from the packet into the image, computed at compile time.
+//! The copies from the packet into the image, computed at compile time.
 #![allow(
     clippy::indexing_slicing,
     clippy::arithmetic_side_effects,
@@ -7,7 +7,7 @@
 
 use crate::sysvar::{INPUT_COUNT, SPANS};
 
-/// Bytes of the packet that go into the image as they are.
+/// Bytes of the packet that are copied unchanged.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Copy {
     pub(super) from: usize,
@@ -15,7 +15,7 @@ pub(super) struct Copy {
     pub(super) len: usize,
 }
 
-/// Eight bool bytes of the packet that are one byte of the image.
+/// Eight bool bytes of the packet that are packed into one byte of the image.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pack {
     pub(super) from: usize,
@@ -23,9 +23,9 @@ pub(super) struct Pack {
     pub(super) mask: u8,
 }
 
-/// Every output word and float, consecutive ones merged.
+/// All output words and floats; consecutive ones are merged.
 pub(super) const COPIES: &[Copy] = OUTPUTS.copies.split_at(OUTPUTS.copy_count).0;
-/// Every output byte.
+/// All output bytes.
 pub(super) const PACKS: &[Pack] = OUTPUTS.packs.split_at(OUTPUTS.pack_count).0;
 struct Outputs {
     copies: [Copy; SPANS.len()],
