@@ -1,8 +1,8 @@
-//! Recipes and ports are added to a configuration, one after the other.
+//! Adds recipes and ports to a configuration.
 //!
-//! In: what a program wrote ([`RecipeBuilder`], [`PortBuilder`]). Out: entries of the
-//! configuration's lists with their ranges, or what is wrong and where. A refused recipe or port
-//! leaves nothing behind. Whether everything fits together is checked by [`ConfigView::validate`].
+//! In: what a program wrote ([`RecipeBuilder`], [`PortBuilder`]). Out: entries in the configuration's lists with their
+//! ranges, or an error and its place. A refused recipe or port changes nothing. [`ConfigView::validate`] checks whether
+//! everything fits together.
 
 use heapless::{String, Vec};
 
@@ -37,7 +37,7 @@ impl<
     /// Sets the controller's address, ports and dialect; the recipe link stays.
     ///
     /// # Errors
-    /// An address that is too long, or an unknown dialect; nothing has changed then.
+    /// An address that is too long, or an unknown dialect; nothing was changed then.
     pub fn set_controller<'a>(
         &mut self,
         controller: impl Into<ControllerBuilder<'a>>,
@@ -48,7 +48,7 @@ impl<
     /// Adds a recipe and returns its index.
     ///
     /// # Errors
-    /// An invalid name, an unknown variable, or no room; nothing was added then.
+    /// An invalid name, an unknown variable, or too little space; nothing was added then.
     pub fn add_recipe(&mut self, recipe: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
         self.view_mut().add_recipe(recipe)
     }
@@ -56,14 +56,13 @@ impl<
     /// Adds a port and returns its index. Its recipe must be added first.
     ///
     /// # Errors
-    /// An invalid name, an unknown recipe, safe values that do not fit, or no room; nothing was
-    /// added then.
+    /// An invalid name, an unknown recipe, safe values that do not fit, or too little space; nothing was added then.
     pub fn add_port<B: PortBus>(&mut self, port: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
         self.view_mut().add_port(port)
     }
 
-    /// Declares that the controller's UDP server at this port, normally 2011, is set to this
-    /// recipe, which must have been added.
+    /// Declares that the controller's UDP server at this port, normally 2011, is set to this recipe, which must be
+    /// added first.
     ///
     /// # Errors
     /// No recipe has this name.
@@ -73,10 +72,7 @@ impl<
 }
 
 impl ConfigMut<'_> {
-    /// As [`GatewayConfig::set_controller`].
-    ///
-    /// # Errors
-    /// See there.
+    /// See [`GatewayConfig::set_controller`].
     pub(crate) fn set_controller(&mut self, from: &ControllerBuilder<'_>) -> Result<(), ConfigError> {
         let at = |key| move |kind| ConfigError { place: Place::Controller(key), kind };
         let address = text(from.address).map_err(at(ControllerKey::Address))?;
@@ -97,20 +93,14 @@ impl ConfigMut<'_> {
         Ok(())
     }
 
-    /// As [`GatewayConfig::set_recipe_link`].
-    ///
-    /// # Errors
-    /// See there.
+    /// See [`GatewayConfig::set_recipe_link`].
     pub(crate) fn set_recipe_link(&mut self, recipe: &str, udp_port: u16) -> Result<(), ConfigError> {
         let recipe = self.recipe_named(recipe, Place::Controller(ControllerKey::RecipeLink))?;
         self.controller.recipe_link = Some(RecipeLink { udp_port, recipe });
         Ok(())
     }
 
-    /// As [`GatewayConfig::add_recipe`].
-    ///
-    /// # Errors
-    /// See there.
+    /// See [`GatewayConfig::add_recipe`].
     pub(crate) fn add_recipe(&mut self, from: &RecipeBuilder<'_>) -> Result<u8, ConfigError> {
         let (fields, commands) = (self.fields.len(), self.commands.len());
         let (exchanges, frames) = (self.exchanges.len(), self.frames.len());
@@ -175,7 +165,7 @@ impl ConfigMut<'_> {
         let frames = |part| added.part_frames(part).count() as u8;
         let frames = FrameNumbers { input: frames(Direction::Input), output: frames(Direction::Output) };
         added.exchanges = self.add_exchanges(recipe, from.exchanges, frames)?;
-        // There is room: checked above.
+        // Cannot fail: space was checked above.
         let _ = self.recipes.push(added);
         Ok(recipe)
     }
@@ -208,7 +198,7 @@ impl ConfigMut<'_> {
         let mut frames = Vec::new();
         for (number, frame) in (0..).zip(from) {
             let fields = self.fields_of_part(recipe, part, number, &frame.fields)?;
-            // There is room: checked above.
+            // Cannot fail: space was checked above.
             let _ = frames.push(CanFramePart { id: frame.id, fields });
         }
         Ok(frames)
@@ -250,7 +240,7 @@ impl ConfigMut<'_> {
         Ok(Span::between(start, self.fields.len()))
     }
 
-    /// There is room: checked when the recipe was begun.
+    /// Cannot fail: space was checked at the beginning of the recipe.
     fn push_field(&mut self, field: FieldSpec) {
         let _ = self.fields.push(field);
     }
@@ -275,7 +265,7 @@ impl ConfigMut<'_> {
         })
     }
 
-    /// There is room: checked when the recipe was begun.
+    /// Space was checked at the beginning of the recipe.
     fn add_commands(&mut self, entries: Entries<'_>, idle: Option<i64>) -> Result<Span, Kind> {
         let start = self.commands.len();
         for (first, last, command) in entries.iter() {
@@ -290,10 +280,7 @@ impl ConfigMut<'_> {
         Ok(Span::between(start, self.commands.len()))
     }
 
-    /// As [`GatewayConfig::add_port`].
-    ///
-    /// # Errors
-    /// See there.
+    /// See [`GatewayConfig::add_port`].
     pub(crate) fn add_port<B: PortBus>(&mut self, from: &PortBuilder<'_, B>) -> Result<u8, ConfigError> {
         let index = self.ports.len() as u8;
         let at = |key| Place::Port { port: index, key };
@@ -339,12 +326,12 @@ impl ConfigMut<'_> {
         };
         added.inspect_err(|_| self.safe_values.truncate(values))?;
         port.on_timeout = Span::between(values, self.safe_values.len());
-        // There is room: checked above.
+        // Cannot fail: space was checked above.
         let _ = self.ports.push(port);
         Ok(index)
     }
 
-    /// There is room: checked before.
+    /// Space was checked by the caller.
     fn add_safe_values(
         &mut self,
         values: impl Iterator<Item = Result<SafeValue, Kind>>,
@@ -395,7 +382,7 @@ fn safe_value(var: SysVar, value: f64) -> Result<SafeValue, Kind> {
     Ok(SafeValue::new(var, value))
 }
 
-/// 0 or 1: that of a bit.
+/// A safe value of a bit must be 0 or 1.
 fn safe_bit(bit: VarBit, value: f64) -> Result<SafeValue, Kind> {
     check_bit(bit)?;
     if value != 0.0 && value != 1.0 {

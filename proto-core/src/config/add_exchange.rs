@@ -1,7 +1,7 @@
-//! Exchanges are added to a configuration with their recipe.
+//! Adds the exchanges of a recipe to a configuration.
 //!
-//! In: what a program wrote ([`ExchangeBuilder`]). Out: entries of the configuration's lists. Coils are packed into
-//! bytes, and registers and coils counted. Room was checked when the recipe was begun.
+//! In: what a program wrote ([`ExchangeBuilder`]). Out: entries in the configuration's lists. Packs coils into bytes,
+//! and counts registers and coils. Space was checked at the beginning of the recipe.
 
 use super::device::register_bits;
 use super::error::{ConfigError, ConfigErrorKind as Kind, ExchangeKey, Place};
@@ -15,7 +15,7 @@ use crate::modbus::rtu::{Operation, Table};
 use crate::recipe::model::MAX_DELIMITER;
 use crate::sysvar::{Direction, ParseError};
 
-/// The numbers of the next frames: of the input part, and of the output part.
+/// Numbers of the next frame of the input part and of the output part.
 #[derive(Clone, Copy)]
 pub(super) struct FrameNumbers {
     pub(super) input: u8,
@@ -158,7 +158,7 @@ impl ConfigMut<'_> {
         Ok(index)
     }
 
-    /// Adds the fields of registers or coils, and counts these.
+    /// Adds the fields of registers or coils, and returns the count of these.
     fn data(
         &mut self,
         (recipe, part, number): (u8, Direction, u8),
@@ -168,7 +168,7 @@ impl ConfigMut<'_> {
         let span = self.fields_of_part(recipe, part, number, from).map_err(RefusedExchange::Placed)?;
         let start = usize::from(span.start);
         if matches!(from, Fields::Specs(_)) && is_of_coils {
-            // As in the configuration: packed already.
+            // Packed already, as in the configuration.
             let fields = self.fields.get(start..).unwrap_or(&[]);
             return Ok((span, bits_of(fields)));
         }
@@ -181,13 +181,13 @@ impl ConfigMut<'_> {
         if !matches!(from, Fields::Specs(_)) {
             fields.iter_mut().for_each(into_register);
         }
-        // Fields of varying length are refused by the check.
+        // Fields of varying length are refused later.
         let bytes = fields.iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
         Ok((span, (bytes / 2) as u16))
     }
 }
 
-/// A mistake, with or without its place.
+/// An error, with or without its place.
 enum RefusedExchange {
     Placed(ConfigError),
     Kind(Kind),
@@ -218,7 +218,7 @@ fn with_counts(operation: Operation, read: u16, written: u16, mask: u16) -> Oper
     Operation::of_function(operation.function(), read, written, mask).unwrap_or(operation)
 }
 
-/// The usual order becomes that of registers.
+/// Changes the default byte order to that of registers.
 fn into_register(field: &mut FieldSpec) {
     let big = |encoding: Encoding| {
         let is_number = !matches!(encoding.kind, EncodingKind::Decimal(_) | EncodingKind::Hex(_));
@@ -245,7 +245,7 @@ fn into_register(field: &mut FieldSpec) {
     };
 }
 
-/// The coils of packed fields: up to the last bit of the last byte that has a field, or all of it.
+/// Number of coils of packed fields: up to the last bit used in the last byte that has a field, or the whole byte.
 fn bits_of(fields: &[FieldSpec]) -> u16 {
     let bytes = fields.iter().map(FieldSpec::longest).fold(0, usize::saturating_add);
     let all = bytes.saturating_mul(8);
@@ -255,7 +255,7 @@ fn bits_of(fields: &[FieldSpec]) -> u16 {
     all.saturating_sub(last) as u16
 }
 
-/// The bit of a byte that a field is.
+/// The bit of a byte that the field is.
 fn bit_of(field: &FieldSpec) -> Option<u8> {
     match field.element()?.encoding()?.kind {
         EncodingKind::Bits(Bits { bytes: 1, first, count: 1, .. }) => Some(first),
@@ -263,7 +263,7 @@ fn bit_of(field: &FieldSpec) -> Option<u8> {
     }
 }
 
-/// Packs coils, the first in the lowest bit; returns the number of fields that are left, and of coils.
+/// Packs coils, the first in the lowest bit; returns the numbers of resulting fields and of coils.
 fn pack(fields: &mut [FieldSpec]) -> Result<(usize, u16), RefusedExchange> {
     let (mut kept, mut count, mut bytes) = (0_usize, 0_usize, 0_usize);
     for nth in 0..fields.len() {
@@ -281,7 +281,7 @@ fn pack(fields: &mut [FieldSpec]) -> Result<(usize, u16), RefusedExchange> {
         let shared = bytes > byte;
         let packed = as_coil(field, first, shared)
             .ok_or(RefusedExchange::Kind(Kind::Exchange(ExchangeError::NotCoils)))?;
-        // No more fields than there were: each one, or each padding, leaves at most one.
+        // Every field or padding results in at most one, so there are never more fields than before.
         put(fields, &mut kept, packed);
         (bytes, count) = (byte.saturating_add(1), count.saturating_add(1));
     }
@@ -296,7 +296,7 @@ fn put(fields: &mut [FieldSpec], kept: &mut usize, field: FieldSpec) {
     }
 }
 
-/// Fills bytes in which all coils are skipped; at most 255, which a check of the count refuses.
+/// Adds padding for bytes without coils; at most 255, which the check of the count refuses.
 fn put_padding(fields: &mut [FieldSpec], kept: &mut usize, bytes: &mut usize, up_to: usize) {
     let missing = up_to.saturating_sub(*bytes);
     if missing > 0 {

@@ -1,8 +1,8 @@
-//! Warnings about what is valid and works, but often is a mistake of somebody who is new to it: an
-//! address as manuals count it, a stop that acts only on an edge, commands that silence forgets, a timeout
-//! that no device can keep.
+//! Warnings about configurations that are valid but contain a typical beginner's mistake: an address as numbered in
+//! manuals, a stop that acts only on an edge, commands that are forgotten after silence, a timeout that no device can
+//! keep.
 //!
-//! In: a configuration. Out: [`Warning`]s. Nothing is refused here.
+//! In: a configuration. Out: [`Warning`]s. Refuses nothing.
 
 use super::{
     Bus, CommandEntry, CommandWhen, ConfigView, Echo, Exchange, FieldSpec, InputBinding, Port, Recipe, Span,
@@ -14,16 +14,16 @@ use crate::modbus::rtu::{BROADCAST, Operation, Table};
 use crate::sysvar::Direction;
 use crate::time::Duration;
 
-/// A device that sends by itself rarely sends more often than 10 times a second and is then supervised
-/// more closely than this; one that sends when something happens is silent for longer.
+/// Devices that send periodically rarely do so more than 10 times a second, and have a shorter timeout than this. A
+/// device that sends on events is silent for longer.
 const SHORT_TIMEOUT: Duration = Duration::from_millis(250);
 
 impl Table {
-    /// The address on the line of what many manuals call by this number, such as 4 for holding register
-    /// 40005. `None` if the number is not one of those.
+    /// The address on the line for a number as in manuals, such as 4 for holding register 40005. `None` if this table
+    /// has no such number.
     pub const fn address_of_number(self, number: u32) -> Option<u16> {
         let (of_five, of_six) = match self {
-            // Those of coils have no digit in front.
+            // Numbers of coils have no leading digit.
             Self::Coils => return None,
             Self::DiscreteInputs => (10_001, 100_001),
             Self::InputRegisters => (30_001, 300_001),
@@ -38,7 +38,7 @@ impl Table {
 }
 
 impl<'c> ConfigView<'c> {
-    /// What often is a mistake.
+    /// All warnings about typical mistakes.
     pub(super) fn advice(self) -> impl Iterator<Item = Warning> + 'c {
         let commands = self.stops_on_edges().chain(self.forgotten_bases());
         let times = self.short_timeouts().chain(self.slow_replies()).chain(self.lost_peers());
@@ -46,7 +46,7 @@ impl<'c> ConfigView<'c> {
         self.manual_addresses().chain(commands).chain(times).chain(events)
     }
 
-    /// Events that a device may carry out twice.
+    /// Events that a device may execute twice.
     fn repeated_events(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
             let all = (0..).zip(self.exchanges_of(of));
@@ -58,7 +58,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Devices that a bit triggers and nothing stops.
+    /// Devices that a bit triggers but nothing stops.
     fn without_stop(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
             let all = self.exchanges_of(of);
@@ -94,7 +94,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Whether the reply of an exchange can have the bytes of its request.
+    /// Whether the reply of an exchange may have the same bytes as its request.
     fn may_be_echo(self, exchange: &Exchange) -> bool {
         match exchange.transaction {
             Transaction::Rtu { operation, .. } => operation.is_repeated_by_reply(),
@@ -106,7 +106,7 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// Replies that need more time on the line than their timeout allows.
+    /// Replies that take longer on the line than their timeout allows.
     fn slow_replies(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.ports).flat_map(move |(port, config)| {
             let of = self.recipes.get(usize::from(config.recipe));
@@ -123,8 +123,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Devices that are told something once, and that nobody asks often enough to see that they were without
-    /// power.
+    /// Devices that receive something only once and have no periodic exchange that would notice a power failure.
     fn lost_peers(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
             let all = self.exchanges_of(of);
@@ -147,7 +146,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Ports whose frames need more time on the line than the timeout leaves.
+    /// Ports whose frames take longer on the line than the timeout allows.
     fn short_timeouts(self) -> impl Iterator<Item = Warning> + 'c {
         let ports = (0..).zip(self.ports).filter(|(_, port)| port.bus.is_field());
         ports.filter_map(move |(port, config)| {
@@ -156,7 +155,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Addresses of Modbus that look like the numbers of a manual.
+    /// Modbus addresses that look like numbers as in manuals.
     fn manual_addresses(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
             (0..).zip(self.exchanges_of(of)).flat_map(move |(exchange, asked)| {
@@ -168,7 +167,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Bits whose stop is picked by an edge alone.
+    /// Bits that stop the robot only on an edge.
     fn stops_on_edges(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.recipes).flat_map(move |(recipe, of)| {
             self.command_fields(of).flat_map(move |(field, table, when)| {
@@ -180,8 +179,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Ports whose commands are forgotten by a silence that is short for a device that sends when
-    /// something happens.
+    /// Ports that forget their commands after a timeout that is short for a device that sends on events.
     fn forgotten_bases(self) -> impl Iterator<Item = Warning> + 'c {
         let of = move |port: &'c Port| self.recipes.get(usize::from(port.recipe));
         let ports = (0..).zip(self.ports).filter(|(_, port)| port.bus.is_field());
@@ -205,7 +203,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// The fields of the frames that come without a request of a known period.
+    /// The fields of the frames that arrive without a periodic request.
     fn unasked(self, recipe: &'c Recipe) -> impl Iterator<Item = Span> + 'c {
         let exchanges = self.exchanges_of(recipe).iter().filter(|exchange| exchange.when.every.is_none());
         let unasked = exchanges.filter_map(move |exchange| exchange.fields(self.frames, Direction::Input));

@@ -1,7 +1,6 @@
-//! How long frames take on a line, and warnings about configurations that are valid but may not do
-//! what was intended.
+//! How long frames take on a line, and warnings about configurations that are valid but may not work as intended.
 //!
-//! In: a configuration. Out: times, and [`Warning`]s. Nothing is refused here.
+//! In: a configuration. Out: times, and [`Warning`]s. Refuses nothing.
 
 use core::fmt;
 
@@ -24,25 +23,25 @@ impl Rs485 {
         bits_time((len as u64).saturating_mul(self.bits_per_character()), self.baud)
     }
 
-    /// A Modbus slave on this line; `None` if that is no address of one.
+    /// A Modbus slave on this line; `None` if the address is invalid.
     pub(crate) fn slave(&self, address: u8) -> Option<Slave> {
         let timing = Timing::new(self.baud, self.bits_per_character() as u8).with_silence(self.idle_gap);
         let echo = if self.echo == Echo::Yes { rtu::Echo::Heard } else { rtu::Echo::Absent };
         Slave::new(timing, echo, address)
     }
 
-    /// The time that `n` and a half characters take on the line.
+    /// The time that `n` + 0.5 characters take on the line.
     pub(crate) fn characters_and_a_half(&self, n: u64) -> Duration {
         let half_bits = n.saturating_mul(2).saturating_add(1).saturating_mul(self.bits_per_character());
         bits_time(half_bits, self.baud.saturating_mul(2))
     }
 }
 
-/// How long a data frame of `len` bytes takes on a CAN bus in the worst case of bit stuffing, with
-/// the space between frames.
+/// The time of a data frame with `len` bytes on a CAN bus, for worst-case bit stuffing and including the interframe
+/// space.
 pub fn can_frame_time(id: CanId, len: usize, bitrate: u32) -> Duration {
     let data = (len as u64).saturating_mul(8);
-    // Bits of the frame that can be stuffed, and bits that cannot (delimiters, end, space).
+    // Bits that are subject to stuffing, and bits that are not (delimiters, end, space).
     let (stuffed, fixed) = match id {
         CanId::Standard(_) => (data.saturating_add(34), 13_u64),
         CanId::Extended(_) => (data.saturating_add(54), 13_u64),
@@ -55,21 +54,19 @@ fn bits_time(bits: u64, per_second: u32) -> Duration {
     Duration::from_micros(bits.saturating_mul(1_000_000).div_ceil(u64::from(per_second.max(1))))
 }
 
-/// How much of a port's line a part of its recipe takes.
+/// Line usage of one part of a port's recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PartBudget {
     /// Frames: 1 in a stream part.
     pub frames: usize,
-    /// Bytes of all frames at their longest, with heads, tails and all escape bytes that they may need; on CAN, of
-    /// their data.
+    /// Maximum number of bytes of all frames, including heads, tails and escape bytes; on CAN, of their data.
     pub bytes: usize,
-    /// Time of all frames on the line; zero where there is no line.
+    /// Time of all frames on the line; zero if there is no line.
     pub time: Duration,
 }
 
 impl<'c> ConfigView<'c> {
-    /// How much of the port's line a part of its recipe takes; `None` if the recipe has no such
-    /// part.
+    /// Line usage of one part of the port's recipe; `None` if the recipe has no such part.
     pub fn budget(self, port: &Port, part: Direction) -> Option<PartBudget> {
         let recipe = self.recipes.get(usize::from(port.recipe))?;
         let bytes_of =
@@ -101,8 +98,7 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// The shortest cycle in which the port's output fits its line (D20); on RS-485 including the
-    /// turnaround.
+    /// The shortest cycle in which the port's output fits its line (D20), including the turnaround on RS-485.
     pub(crate) fn shortest_cycle(self, port: &Port) -> Duration {
         let time = self.budget(port, Direction::Output).map_or(Duration::ZERO, |budget| budget.time);
         match &port.bus {
@@ -111,7 +107,7 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// What is valid but may not do what was intended.
+    /// Warnings about settings that are valid but may not work as intended.
     pub fn warnings(self) -> impl Iterator<Item = Warning> + 'c {
         let lines = self.slow_ports().chain(self.exchanges());
         lines.chain(self.advice()).chain(self.read_back()).chain(self.unused_recipes())
@@ -124,7 +120,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// What the exchanges of a port ask too often, or too rarely.
+    /// Warnings about exchanges of a port that are too frequent or too rare.
     fn exchanges(self) -> impl Iterator<Item = Warning> + 'c {
         (0..).zip(self.ports).flat_map(move |(port, config)| {
             let percent = self.line_share(config).filter(|percent| *percent > 100);
@@ -153,7 +149,7 @@ impl<'c> ConfigView<'c> {
             .filter_map(move |(recipe, _)| (!is_used(recipe)).then_some(Warning::Unused { recipe }))
     }
 
-    /// Whether the gateway answers the recipe's exchanges as a slave.
+    /// Whether the gateway serves the recipe's exchanges as a slave.
     fn is_slave(self, recipe: u8) -> bool {
         let recipe = self.recipes.get(usize::from(recipe));
         recipe.is_some_and(|recipe| self.exchanges_of(recipe).iter().any(Exchange::is_served))
@@ -165,12 +161,11 @@ impl<'c> ConfigView<'c> {
     }
 }
 
-/// Something that is valid but may not do what was intended. Numbers are indices, from 0.
+/// A setting that is valid but may not work as intended. Numbers are indices from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Warning {
-    /// A port's output does not fit its cycle on its line (D20): it is sent back to back, and
-    /// cycles are skipped.
+    /// A port's output takes longer than its cycle on its line (D20): it is sent back to back, and cycles are skipped.
     DoesNotFit {
         /// The port.
         port: u8,
@@ -179,16 +174,15 @@ pub enum Warning {
         /// The shortest cycle in which the output fits.
         shortest: Duration,
     },
-    /// The exchanges of a port with a period take more than the whole time of its line: they are asked
-    /// less often.
+    /// The periodic exchanges of a port take more than all of its line's time: they are sent less often.
     LineFull {
         /// The port.
         port: u8,
-        /// The time that they take, in percent.
+        /// Their time in percent.
         percent: u32,
     },
-    /// A port's timeout is not longer than the period of one of its exchanges: the values of its reply
-    /// are overdue until the next one.
+    /// A port's timeout is not longer than the period of one of its exchanges: the values of its reply become overdue
+    /// before the next one.
     AskedRarely {
         /// The port.
         port: u8,
@@ -197,16 +191,16 @@ pub enum Warning {
         /// The longest period.
         every: Duration,
     },
-    /// The address of an exchange or block of Modbus looks like a manual's number, such as 40005, which
-    /// counts from 40001.
+    /// A Modbus address of an exchange or block looks like a number as in manuals, such as 40005, which counts from
+    /// 40001.
     ManualAddress {
         /// The recipe.
         recipe: u8,
         /// Index of the exchange in the recipe.
         exchange: u8,
-        /// The address as it is configured.
+        /// The configured address.
         number: u16,
-        /// The address on the line, if it is such a number.
+        /// The address on the line for such a number.
         address: u16,
     },
     /// A bit stops the robot only when it changes to 1.
@@ -216,7 +210,7 @@ pub enum Warning {
         /// Index of the command.
         entry: u16,
     },
-    /// Commands of a device that nobody asks are forgotten by a short silence: the next value picks
+    /// The commands of a device that sends on its own are forgotten after a short silence: the next value then selects
     /// none.
     ForgetsBase {
         /// The port.
@@ -224,33 +218,34 @@ pub enum Warning {
         /// Its timeout.
         timeout: Duration,
     },
-    /// A device is told something at the start or when it changes, and nothing is asked of it with a period:
-    /// nobody notices that it was without power, so it is not told again.
+    /// A device receives something only at the start or on change, and has no periodic exchange: a power failure is not
+    /// noticed, so nothing is sent again.
     NeverLookedFor {
         /// The recipe.
         recipe: u8,
-        /// Index of the first such exchange with it.
+        /// Index of the first such exchange with the device.
         exchange: u8,
         /// The slave's address, or the number of the device.
         peer: u8,
     },
-    /// A port's timeout is shorter than two of its input frames take on the line, one after the other.
+    /// A port's timeout is shorter than two of its input frames take on the line.
     ShortTimeout {
         /// The port.
         port: u8,
         /// Its timeout.
         timeout: Duration,
-        /// How long the frames take.
+        /// Time of the frames.
         time: Duration,
     },
-    /// An event, or what is only asked at the start, is repeated without a reply: the device may carry it out twice.
+    /// An event, or a request sent only at the start, is repeated if the reply is missing: the device may execute it
+    /// twice.
     RepeatedEvent {
         /// The recipe.
         recipe: u8,
         /// Index of the exchange in the recipe.
         exchange: u8,
     },
-    /// A bit triggers a write to a device, and nothing stops the device.
+    /// A bit triggers a write to a device, but nothing stops the device.
     NoStop {
         /// The recipe.
         recipe: u8,
@@ -259,8 +254,8 @@ pub enum Warning {
         /// The slave's address, or the number of the device.
         peer: u8,
     },
-    /// Whether a line echoes is to be learned, and none of its exchanges has a reply that differs from its request: no
-    /// write is ever confirmed.
+    /// Whether the line echoes is to be learned, but no exchange has a reply that differs from its request: no write is
+    /// ever confirmed.
     EchoUnknown {
         /// The port.
         port: u8,
@@ -271,15 +266,15 @@ pub enum Warning {
         port: u8,
         /// Index of the exchange in the recipe.
         exchange: u8,
-        /// The time of the reply on the line, with the silence before it.
+        /// Time of the reply on the line, including the silence before it.
         time: Duration,
         /// Its timeout.
         timeout: Duration,
     },
-    /// A way up carries a variable that no port writes: it is read back from the state stream and
-    /// sent on, so for 100 ms a change made by somebody else can be undone.
+    /// A route carries a variable that no port writes: it is read from the state stream and sent back, so a change by
+    /// somebody else can be undone for 100 ms.
     ReadBack {
-        /// The recipe of the way up.
+        /// The recipe of the route.
         recipe: u8,
         /// The variable.
         var: SysVar,
@@ -337,7 +332,7 @@ impl fmt::Display for DescribedWarning<'_> {
 }
 
 impl DescribedWarning<'_> {
-    /// What may not do what was intended, behind the place.
+    /// The text of the warning, after its place.
     fn fmt_text(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.warning {
             Warning::LineFull { percent, .. } => write!(
@@ -446,7 +441,7 @@ mod tests {
 
     #[test]
     fn can_times_are_the_worst_case_of_stuffing() {
-        // 135 and 160 bits: the known maxima for eight data bytes with the space between frames.
+        // 135 and 160 bits: the known maxima for eight data bytes, including the interframe space.
         assert_eq!(can_frame_time(CanId::Standard(1), 8, 1_000_000), Duration::from_micros(135));
         assert_eq!(can_frame_time(CanId::Extended(1), 8, 1_000_000), Duration::from_micros(160));
         assert_eq!(can_frame_time(CanId::Standard(1), 0, 500_000), Duration::from_micros(110));

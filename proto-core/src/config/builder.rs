@@ -1,8 +1,8 @@
-//! A configuration in one expression.
+//! Builds a configuration in one expression.
 //!
-//! In: controller, recipes, ports, in this order. Out: a checked [`GatewayConfig`], or the first
-//! mistake. A board with a small stack uses `set_controller`, `add_recipe` and `add_port` on a
-//! static configuration instead; they do the same step by step.
+//! In: controller, recipes, ports, in this order. Out: a checked [`GatewayConfig`], or the first error. For a board
+//! with a small stack, `set_controller`, `add_recipe` and `add_port` do the same step by step on a static
+//! configuration.
 
 use super::draft::{ControllerBuilder, PortBuilder, PortBus, RecipeBuilder};
 use super::error::{ConfigError, ConfigErrorKind as Kind, Counted};
@@ -27,7 +27,7 @@ pub struct ConfigBuilder<
     needed: Needed,
 }
 
-/// Number of items asked for, including those for which there was no room.
+/// Number of items added, including those that did not fit.
 #[derive(Debug, Clone, Copy, Default)]
 struct Needed {
     ports: usize,
@@ -50,8 +50,8 @@ impl<
 {
     /// Builds a configuration in one expression; a recipe comes before the ports that use it.
     ///
-    /// The builder moves by value. Where the stack is small, take a static [`Self::empty`] and
-    /// [`Self::set_controller`], [`Self::add_recipe`], [`Self::add_port`], [`Self::validate`].
+    /// The builder is moved by value. If the stack is small, use a static [`Self::empty`] with
+    /// [`Self::set_controller`], [`Self::add_recipe`], [`Self::add_port`] and [`Self::validate`].
     ///
     /// ```
     /// use proto_core::config::{GatewayConfig, Port, Recipe};
@@ -138,8 +138,7 @@ impl<
     /// Checks the configuration and returns it.
     ///
     /// # Errors
-    /// The first mistake, with its place. If there is too little room, `needed` is the number of
-    /// all items that were asked for.
+    /// The first error, with its place. If items did not fit, `needed` is the number of all items added.
     pub fn build(
         self,
     ) -> Result<GatewayConfig<PORTS, RECIPES, ALL_FIELDS, COMMANDS, SAFE_VALUES, EXCHANGES>, ConfigError>
@@ -157,14 +156,14 @@ impl<
                 Counted::SafeValues => self.needed.safe_values,
                 Counted::Exchanges => self.needed.exchanges,
                 Counted::ExchangeFrames => self.needed.frames,
-                // Lists of one recipe, and those of the engine.
+                // Limits of a single recipe, or of the engine.
                 _ => *needed,
             };
         }
         Err(error)
     }
 
-    /// After the first mistake items are only counted.
+    /// After the first error, items are only counted.
     fn attempt(
         &mut self,
         add: impl FnOnce(

@@ -1,4 +1,4 @@
-//! The checks that concern the exchanges of one recipe.
+//! Checks of the exchanges of one recipe.
 
 use super::check_limits::check_number_read;
 use super::device::register_bits;
@@ -16,7 +16,7 @@ use crate::recipe::model::{MAX_CAN_IDS, Mode};
 use crate::sysvar::Direction;
 use crate::time::Duration;
 
-/// The longest pause after an exchange.
+/// Maximum pause after an exchange.
 pub const MAX_PAUSE: Duration = Duration::from_secs(10);
 /// The exchanges of one recipe under check.
 pub(super) struct ExchangeCheck<'a> {
@@ -82,7 +82,7 @@ impl<'a> ExchangeCheck<'a> {
         Ok(())
     }
 
-    /// What becomes of events, in which order, and what the robot is told of it.
+    /// Checks events: their times, their order, and the variables for their outcome.
     fn check_event(&self, nth: u8, exchange: &Exchange) -> Check {
         if let Some(time) = exchange.trigger {
             if !exchange.is_event() {
@@ -127,8 +127,8 @@ impl<'a> ExchangeCheck<'a> {
         refuse(ExchangeError::FollowsCircle)
     }
 
-    /// Whether the frames that the exchange takes are told from all others that can come while they are
-    /// awaited: those of one exchange, and those that come unasked.
+    /// Checks that the frames an exchange accepts can be told from all others that may arrive at that time: those of
+    /// the same exchange, and unsolicited ones.
     fn check_ids(&self, nth: u8, exchange: &Exchange) -> Check {
         let Transaction::Frames { request, reply, refusal } = exchange.transaction else { return Ok(()) };
         let spec = |index: u8| self.config.frames.get(usize::from(index));
@@ -234,13 +234,13 @@ impl<'a> ExchangeCheck<'a> {
         }
     }
 
-    /// Whether all ports with this recipe are of Modbus TCP, whose unit ids have no end but that of a byte.
+    /// Whether all ports with this recipe are Modbus TCP, where unit ids use the whole byte.
     fn is_only_over_tcp(&self) -> bool {
         let mut own = self.config.ports.iter().filter(|port| port.recipe == self.index).peekable();
         own.peek().is_some() && own.all(|port| port.bus.is_modbus_tcp())
     }
 
-    /// Counts, and that the fields fill them: those that are written, and those that are read.
+    /// Checks the counts, and that the written and read fields fill them.
     fn check_operation(&self, nth: u8, operation: Operation, spans: [(Direction, Span); 2]) -> Check {
         let refuse = |error| self.refuse(nth, Key::Registers, error);
         if let Err(error) = operation.check() {
@@ -335,7 +335,7 @@ impl<'a> ExchangeCheck<'a> {
         }
     }
 
-    /// The field that tells of a restart.
+    /// Checks the field that shows a restart.
     fn check_restarted(&self, nth: u8, exchange: &Exchange) -> Check {
         let Some(restarted) = exchange.restarted else { return Ok(()) };
         let refuse = |error| self.refuse(nth, Key::Restarted, error);
@@ -355,12 +355,12 @@ impl<'a> ExchangeCheck<'a> {
         }
     }
 
-    /// The place of a mistake in a frame of an exchange that is counted in this part.
+    /// The place of an error in a frame of an exchange that is counted in this part.
     fn place_of(&self, nth: u8, part: Direction, fields: &[FieldSpec], error: LayoutError) -> Place {
         let recipe = self.index;
         let exchange = self.config.exchanges_of(self.recipe).get(usize::from(nth));
         let mut walk = self.config.frames_of(self.recipe, part);
-        // The frame of this exchange that has these fields.
+        // Whether a frame belongs to this exchange and has these fields.
         let is_it = |of: Option<(&Exchange, bool)>, span: Span| {
             let own = exchange.zip(of).is_some_and(|(own, (other, _))| core::ptr::eq(own, other));
             own && core::ptr::eq(span.of(self.config.fields), fields)
@@ -383,7 +383,7 @@ impl FrameSpec {
     /// The frame's elements and layout.
     ///
     /// # Errors
-    /// [`LayoutError`]: its elements are counted without the checksum.
+    /// [`LayoutError`]; its element indices do not count the checksum.
     pub(crate) fn layout(&self, config: ConfigView<'_>, part: Direction) -> Result<DeviceFrame, LayoutError> {
         let fields: &[FieldSpec] = self.fields.of(config.fields);
         let carrier = if self.id.is_some() { Carrier::Can } else { Carrier::Stream };
@@ -391,7 +391,7 @@ impl FrameSpec {
     }
 }
 
-/// Whether a field picks a command or is an alive counter.
+/// Whether a field selects a command or is an alive counter.
 fn is_command_or_counter(field: &FieldSpec) -> bool {
     match field {
         FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
@@ -401,7 +401,7 @@ fn is_command_or_counter(field: &FieldSpec) -> bool {
     }
 }
 
-/// Whether two blocks of a slave have a register or coil in common.
+/// Whether two blocks of a slave overlap.
 fn overlap(one: &Exchange, other: &Exchange) -> bool {
     let (Transaction::Served { operation: one, .. }, Transaction::Served { operation: other, .. }) =
         (&one.transaction, &other.transaction)
@@ -413,7 +413,7 @@ fn overlap(one: &Exchange, other: &Exchange) -> bool {
     table == others && u32::from(from) < end(at, len) && u32::from(at) < end(from, count)
 }
 
-/// The address and count that go beyond the last register or coil, 65535.
+/// Address and count, if they exceed the last register or coil, 65535.
 fn beyond_last(operation: &Operation) -> Option<(u16, u16)> {
     let (_, address, count) = operation.place();
     let written = match *operation {

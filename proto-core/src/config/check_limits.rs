@@ -1,6 +1,6 @@
-//! The checks of what stands behind a field: limits, tables of numbers, rules of input fields.
+//! Checks of the entries that follow a field: limits, tables of numbers, rules of input fields.
 //!
-//! In: the fields of a frame, in order. Out: nothing, or what is wrong with one of them.
+//! In: the fields of a frame, in order. Out: nothing, or an error in one of them.
 
 use super::error::{ConfigError, ConfigErrorKind as Kind, Place};
 use super::rules::{Check, check_bit, fail};
@@ -10,18 +10,18 @@ use crate::image::{bind_to_variable, round};
 use crate::sysvar::{Direction, SysVar, VarBit};
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// What stands behind an output field, while the fields of a frame are checked in order.
+/// Checks the entries that follow an output field, while the fields of a frame are checked in order.
 #[derive(Default)]
 pub(super) struct Behind<'c> {
-    /// The output field, and all from it on.
+    /// The output field, and the rest of the fields, beginning with it.
     field: Option<(Encoding, Overflow, OutputBinding, &'c [FieldSpec])>,
     has_limits: bool,
-    /// Entries of its table so far.
+    /// Number of table entries so far.
     entries: usize,
 }
 
 impl<'c> Behind<'c> {
-    /// Looks at the first of these fields, the rest of a frame's.
+    /// Checks the first field of `rest`.
     pub(super) fn check(&mut self, place: Place, rest: &'c [FieldSpec]) -> Check {
         let Some((field, _)) = rest.split_first() else { return Ok(()) };
         match *field {
@@ -71,7 +71,7 @@ impl<'c> Behind<'c> {
         *self = Self { field, ..Self::default() };
     }
 
-    /// The field that it stands behind.
+    /// The output field to which the entry belongs.
     fn bound(&self, place: Place) -> Result<(Encoding, OutputBinding), ConfigError> {
         match self.field {
             Some((_, Overflow::Wrap, ..)) => Err(ConfigError { place, kind: Kind::LimitsAndWrap }),
@@ -83,7 +83,7 @@ impl<'c> Behind<'c> {
     }
 }
 
-/// Counts wrap in their field.
+/// Whether the source is a count, which wraps in its field.
 const fn is_count(from: OutputBinding) -> bool {
     match from {
         OutputBinding::Counter | OutputBinding::CounterTo { .. } => true,
@@ -113,7 +113,7 @@ fn check_order(place: Place, limits: &Limits) -> Check {
     if low > high { fail(place, Kind::BackwardLimits { low, high }) } else { Ok(()) }
 }
 
-/// `encoding` is of the field that has the number of the entry, if one has.
+/// `encoding` is that of the field with the entry's number, if there is one.
 fn check_entry<'c>(
     place: Place,
     encoding: Option<&Encoding>,
@@ -138,7 +138,7 @@ fn check_entry<'c>(
     }
 }
 
-/// Checks that a field can have a number as it is, so that it is sent unchanged.
+/// Checks that a number can be sent unchanged in a field.
 ///
 /// # Errors
 /// [`ConfigErrorKind::NotInField`](Kind::NotInField), [`ConfigErrorKind::FractionOfInteger`](Kind::FractionOfInteger)
@@ -162,12 +162,12 @@ fn check_number(place: Place, encoding: &Encoding, value: f64) -> Check {
     check_sent(encoding, value).map_err(|kind| ConfigError { place, kind })
 }
 
-/// What stands behind an input field, while the fields of a frame are checked in order.
+/// Checks the entries that follow an input field, while the fields of a frame are checked in order.
 #[derive(Default)]
 pub(super) struct BehindInput<'c> {
     field: Option<Own<'c>>,
     has_limits: bool,
-    /// Entries of its table so far.
+    /// Number of table entries so far.
     entries: usize,
     has_else: bool,
     has_valid: bool,
@@ -181,12 +181,12 @@ struct Own<'c> {
     overflow: Overflow,
     var: SysVar,
     is_scaled: bool,
-    /// All from it on.
+    /// The rest of the fields, beginning with it.
     all: &'c [FieldSpec],
 }
 
 impl<'c> BehindInput<'c> {
-    /// Looks at the first of these fields, the rest of a frame's.
+    /// Checks the first field of `rest`.
     pub(super) fn check(&mut self, place: Place, rest: &'c [FieldSpec]) -> Check {
         let Some((field, _)) = rest.split_first() else { return Ok(()) };
         match *field {
@@ -235,7 +235,7 @@ impl<'c> BehindInput<'c> {
         self.becomes(place, own, entry.sent)
     }
 
-    /// Whether the variable can have a number of a table.
+    /// Checks that the variable can have a number from a table.
     fn becomes(&self, place: Place, own: Own<'_>, number: f64) -> Check {
         let fits = match self.is_int16 {
             true => (-32_768.0..=32_767.0).contains(&number),
@@ -257,7 +257,7 @@ impl<'c> BehindInput<'c> {
                 if own.var.ty() != ScalarType::Word {
                     return fail(place, Kind::NotAWord { var: own.var });
                 }
-                // What a table has is judged by it.
+                // The numbers of a table depend on this rule, so it must come first.
                 if self.entries > 0 || self.has_else || core::mem::replace(&mut self.is_int16, true) {
                     return fail(place, Kind::RuleTwice);
                 }
@@ -311,7 +311,7 @@ impl<'c> BehindInput<'c> {
     }
 }
 
-/// Checks that a number can be read from a field.
+/// Checks that a number can be received in a field.
 ///
 /// # Errors
 /// [`ConfigErrorKind::NotInField`](Kind::NotInField) or [`ConfigErrorKind::FractionOfInteger`](Kind::FractionOfInteger).
@@ -328,7 +328,7 @@ pub(super) fn check_number_read(place: Place, encoding: &Encoding, value: f64) -
     check_read(encoding, value).map_err(|kind| ConfigError { place, kind })
 }
 
-/// A field that writes a variable as a whole.
+/// The input field, if it writes a variable as a whole.
 fn own_of<'c>(field: &FieldSpec, all: &'c [FieldSpec]) -> Option<Own<'c>> {
     let (encoding, overflow, to) = match *field {
         FieldSpec::UserInput { ty, to } => (Encoding::scalar(ty), Overflow::Usual, to),

@@ -1,5 +1,4 @@
-//! The checks that concern one recipe alone: its parts, the bindings of its user fields, its
-//! trigger.
+//! Checks of a single recipe: its parts, the bindings of its user fields, its trigger.
 
 use super::check_exchange::ExchangeCheck;
 use super::check_limits::{Behind, BehindInput};
@@ -19,7 +18,7 @@ use crate::sysvar::{COUNT, Direction, SysVar, VarBit};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// One recipe under check.
+/// A recipe to check.
 pub(super) struct RecipeCheck<'a> {
     config: ConfigView<'a>,
     index: u8,
@@ -38,7 +37,7 @@ impl<'a> RecipeCheck<'a> {
         if !self.has(Direction::Input) && !self.has(Direction::Output) {
             return fail(self.at(RecipeKey::Whole), Kind::NoParts);
         }
-        // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
+        // UDP has the weakest requirements for a stream recipe, but does not support user-defined ones (D16).
         let framing = if self.recipe.mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
         let is_device = self.config.is_device(self.recipe);
         for part in [Direction::Input, Direction::Output] {
@@ -116,7 +115,7 @@ impl<'a> RecipeCheck<'a> {
                 | FieldSpec::Checksum(_)
                 | FieldSpec::Length(_),
             )
-            // What they stand behind is checked with the frame.
+            // Checked together with the frame.
             | (Mode::User, _, FieldSpec::Limits(_) | FieldSpec::Mapped(_))
             | (Mode::User, Direction::Input, FieldSpec::InputRule(_)) => Ok(()),
             (Mode::User, Direction::Input, FieldSpec::TextInput { to, length_to, count_to, .. }) => {
@@ -136,17 +135,17 @@ impl<'a> RecipeCheck<'a> {
         }
     }
 
-    /// What output fields may send.
+    /// Checks what output fields may send.
     fn check_sendable(&self) -> Check {
         self.check_behind(Direction::Output, Behind::check)
     }
 
-    /// What becomes of the values of input fields.
+    /// Checks the rules of input fields.
     fn check_rules(&self) -> Check {
         self.check_behind(Direction::Input, BehindInput::check)
     }
 
-    /// Looks at each field of a part, with what stands behind it in its frame; each frame begins with nothing.
+    /// Checks each field of a part with the entries that follow it; each frame starts with a new state.
     fn check_behind<B: Default>(
         &self,
         part: Direction,
@@ -198,11 +197,11 @@ impl<'a> RecipeCheck<'a> {
         }
     }
 
-    /// The checks of sources that are no variables, the same for every field.
+    /// Checks sources that are not variables, for any kind of field.
     fn check_source(&self, place: Place, from: OutputBinding) -> Check {
         match from {
             OutputBinding::State { value, scale, offset } => {
-                // An unknown dialect is refused first.
+                // An unknown dialect has already been refused.
                 let dialect = Dialect::named(&self.config.controller.dialect).unwrap_or(Dialect::V2_3);
                 if let Err(error) = value.place(&dialect) {
                     return fail(place, Kind::StateValue(error));
@@ -272,7 +271,7 @@ impl<'a> RecipeCheck<'a> {
         Ok(())
     }
 
-    /// What tells the frames of a stream part apart.
+    /// Checks how the frames of a stream part are separated.
     fn check_framing(&self, part: Direction) -> Check {
         let Some(stream) = self.recipe.stream_part(part).filter(|stream| stream.is_cut()) else {
             return Ok(());
@@ -316,7 +315,7 @@ impl<'a> RecipeCheck<'a> {
         }
     }
 
-    /// In a plain recipe the layout checks this.
+    /// The layout checks this for recipes that are not a device's.
     fn check_ids(&self, part: Direction, frames: &[CanFramePart]) -> Check {
         let recipe = self.index;
         let constants = |frame: &CanFramePart| Constants::of(frame.fields.of(self.config.fields), part);
@@ -335,7 +334,7 @@ impl<'a> RecipeCheck<'a> {
         Ok(())
     }
 
-    /// In a realtime recipe the layout checks this.
+    /// The layout checks this for realtime recipes.
     fn check_written_once(&self) -> Check {
         let mut seen = [false; COUNT];
         let mut bits = BitSet::EMPTY;
@@ -387,13 +386,13 @@ impl<'a> RecipeCheck<'a> {
     }
 }
 
-/// The numbers that a field can have.
+/// The range of a field's numbers.
 #[derive(Clone, Copy)]
 struct Numbers {
     low: f64,
     high: f64,
     integers: bool,
-    /// Its type, if it is one of the recipes' own.
+    /// The type, if it is one of the recipes' own.
     ty: Option<ScalarType>,
 }
 
@@ -408,7 +407,7 @@ impl Numbers {
     }
 }
 
-/// An alive counter is an unsigned integer.
+/// The field of an alive counter must have unsigned integers.
 fn check_counter(place: Place, numbers: Numbers, max: u32) -> Check {
     let is_unsigned = numbers.integers && numbers.low == 0.0;
     let high = if is_unsigned { numbers.high.min(f64::from(u32::MAX)) } else { -1.0 };
@@ -436,7 +435,7 @@ fn check_device_output(place: Place, encoding: &Encoding, from: OutputBinding) -
     }
 }
 
-/// Texts are in word variables of one group.
+/// The words of a text must be word variables of one group.
 fn check_words(place: Place, words: Option<Words>) -> Check {
     let Some(words @ Words { first, count, order }) = words else { return Ok(()) };
     let is_one_run = words.iter().all(|var| var.group() == first.group() && var.ty() == ScalarType::Word);
@@ -451,7 +450,7 @@ fn check_word(place: Place, vars: impl IntoIterator<Item = SysVar>) -> Check {
     other.map_or(Ok(()), |var| fail(place, Kind::NotWords { var, count: 1 }))
 }
 
-/// A command must be one with each of its values: with the first and the last one, it is with all.
+/// Checks a command with its first and its last value; if both are valid, all are.
 fn check_command_text(place: Place, command: &CommandEntry) -> Check {
     if command.is_idle() {
         return Ok(());
@@ -500,7 +499,7 @@ fn check_output(place: Place, ty: ScalarType, from: OutputBinding) -> Check {
     }
 }
 
-/// Compiles one part of a recipe that is no device's, if it has it, only to find its mistakes.
+/// Compiles one part of a recipe that is not a device's, only to find errors.
 pub(super) fn check_layout(
     config: ConfigView<'_>,
     recipe: &Recipe,

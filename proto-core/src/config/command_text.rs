@@ -1,7 +1,6 @@
-//! The values of a command table's entry, and its text with a value in it.
+//! The values of a command table's entry, and its text with a value inserted.
 //!
-//! In: a text such as `speed({value})`, and a value. Out: `speed(40)`, without formatting, which
-//! could panic.
+//! In: a text such as `speed({value})`, and a value. Out: `speed(40)`. Does not use formatting, which could panic.
 
 use core::fmt::{self, Write};
 
@@ -9,7 +8,7 @@ use heapless::{String, Vec};
 
 use super::{CommandEntry, MAX_COMMAND_TEXT};
 
-/// What stands for the field's value in the text of a command.
+/// Placeholder for the field's value in the text of a command.
 const PLACEHOLDER: &str = "{value}";
 
 impl CommandEntry {
@@ -18,18 +17,17 @@ impl CommandEntry {
         Self { first: value, last: value, text }
     }
 
-    /// Whether the field's value is one of the entry's.
+    /// Whether the entry is for this field value.
     pub const fn has(&self, value: i64) -> bool {
         self.first <= value && value <= self.last
     }
 
-    /// Whether the values pick nothing.
+    /// Whether the values select nothing.
     pub fn is_idle(&self) -> bool {
         self.text.is_empty()
     }
 
-    /// The command for a value, such as `speed(40)`; `None` if it is longer than
-    /// [`MAX_COMMAND_TEXT`].
+    /// The command for a value, such as `speed(40)`; `None` if it is longer than [`MAX_COMMAND_TEXT`].
     pub fn text_for(&self, value: i64) -> Option<String<MAX_COMMAND_TEXT>> {
         fill_in(&self.text, value)
     }
@@ -43,7 +41,7 @@ impl CommandEntry {
     }
 }
 
-/// The text of a command that a value picked, such as `speed(40)`.
+/// The text of a selected command, such as `speed(40)`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CommandText<'a> {
     pub(crate) text: &'a str,
@@ -66,13 +64,13 @@ impl fmt::Display for CommandText<'_> {
     }
 }
 
-/// How often the value stands in the text. Searching for a `str` could panic.
+/// Number of placeholders in the text. Searching for a `str` could panic.
 pub(crate) fn placeholders(text: &str) -> usize {
     let is_one = |part: &&[u8]| *part == PLACEHOLDER.as_bytes();
     text.as_bytes().windows(PLACEHOLDER.len()).filter(is_one).count()
 }
 
-/// The text with the value in it; `None` if it is too long.
+/// Inserts the value in the text; `None` if the result is too long.
 pub(crate) fn fill_in(text: &str, value: i64) -> Option<String<MAX_COMMAND_TEXT>> {
     let (digits, mut filled) = (decimal(value), String::new());
     let mut rest = text;
@@ -89,11 +87,11 @@ pub(crate) fn fill_in(text: &str, value: i64) -> Option<String<MAX_COMMAND_TEXT>
     Some(filled)
 }
 
-/// An integer as decimal digits, the last one first, and a sign if it is negative.
+/// An integer as decimal digits in reverse order, ending with a sign if negative.
 fn decimal(value: i64) -> Vec<u8, MAX_DECIMAL> {
     let mut digits: Vec<u8, MAX_DECIMAL> = Vec::new();
     let mut rest = value.unsigned_abs();
-    // There is room for the digits of every integer.
+    // Every integer fits.
     while rest >= 10 {
         let _ = digits.push(b'0'.wrapping_add((rest % 10) as u8));
         rest /= 10;
@@ -105,7 +103,7 @@ fn decimal(value: i64) -> Vec<u8, MAX_DECIMAL> {
     digits
 }
 
-/// The longest decimal of an `i64`.
+/// Length of the longest `i64` in decimal.
 const MAX_DECIMAL: usize = 20;
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
-//! What is wrong with a configuration, in words.
+//! Error texts for configurations.
 //!
-//! In: an error, and the configuration if available. Out: one sentence that says what is wrong and
-//! what is allowed. Recipes and ports are named, or counted from 1.
+//! In: an error, and the configuration if available. Out: one sentence that says what is wrong and what is allowed.
+//! Recipes and ports are named, or counted from 1.
 
 use core::fmt;
 
@@ -38,7 +38,7 @@ impl<'c> ConfigView<'c> {
         Described { config: Some(self), error }
     }
 
-    /// Displays what is wrong, with the names of recipes and ports and without the place.
+    /// Displays what is wrong, with the names of recipes and ports, but without the place.
     pub fn describe_kind(self, kind: ConfigErrorKind) -> impl fmt::Display + 'c {
         DescribedKind { config: Some(self), kind }
     }
@@ -299,7 +299,7 @@ impl fmt::Display for DescribedKind<'_> {
 }
 
 impl ConfigErrorKind {
-    /// What is wrong with a variable or a bit.
+    /// Errors in a variable or bit.
     fn fmt_variable(self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         use ConfigErrorKind as Kind;
         match self {
@@ -360,7 +360,7 @@ impl ConfigErrorKind {
         }
     }
 
-    /// What is wrong with a number or a text.
+    /// Errors in a number or text.
     fn fmt_value(self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         use ConfigErrorKind as Kind;
         match self {
@@ -448,7 +448,7 @@ impl ConfigErrorKind {
         }
     }
 
-    /// What is wrong, where that needs neither names nor numbers.
+    /// Errors whose text needs neither names nor numbers.
     fn sentence(self) -> &'static str {
         use ConfigErrorKind as Kind;
         match self {
@@ -548,7 +548,7 @@ impl fmt::Display for ExchangeError {
 }
 
 impl ExchangeError {
-    /// Why, where that needs no numbers.
+    /// Errors whose text needs no numbers.
     fn sentence(&self) -> &'static str {
         match self {
             Self::NeedsUser => "exchanges need mode = \"user\"",

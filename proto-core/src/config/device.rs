@@ -1,6 +1,6 @@
-//! Frames of devices in a configuration: the fields of one frame as the elements of a layout.
+//! Frames of devices in a configuration: converts the fields of a frame to the elements of a layout.
 //!
-//! In: the fields of a user recipe's frame. Out: elements and layout, or what is wrong with them.
+//! In: the fields of a user recipe's frame. Out: elements and layout, or the error in them.
 
 use heapless::Vec;
 
@@ -13,7 +13,7 @@ use crate::sysvar::Direction;
 /// The elements of one frame, and its layout.
 #[derive(Debug, Clone)]
 pub struct DeviceFrame {
-    /// What the frame consists of, without the checksum.
+    /// The frame's elements, without the checksum.
     pub elements: Vec<Element, MAX_FIELDS>,
     /// Their layout.
     pub layout: FrameLayout,
@@ -23,7 +23,7 @@ impl DeviceFrame {
     /// Lays out a frame. Head and tail are those of a stream part, or empty.
     ///
     /// # Errors
-    /// [`LayoutError`]: its elements are counted without the checksum.
+    /// [`LayoutError`]; its element indices do not count the checksum.
     pub fn new(
         carrier: Carrier,
         direction: Direction,
@@ -49,9 +49,9 @@ impl DeviceFrame {
     }
 }
 
-/// The index of the field that a frame cannot be laid out for, if it is one.
+/// The index of the field that causes a layout error, if a field does.
 pub(super) fn field_of(fields: &[FieldSpec], error: LayoutError) -> Option<u8> {
-    // A checksum is a field, and no element.
+    // A checksum is a field, but not an element.
     let field = match error.element().map(usize::from) {
         Some(element) => {
             let is_element = |field: &(usize, &FieldSpec)| field.1.element().is_some();
@@ -65,9 +65,9 @@ pub(super) fn field_of(fields: &[FieldSpec], error: LayoutError) -> Option<u8> {
     field.map(|field| field as u8)
 }
 
-/// The bits of one register, highest byte first, that have a field: what
-/// [`Operation::MaskWriteRegister`](crate::modbus::rtu::Operation::MaskWriteRegister) writes. Padding has none; fields of
-/// more than two bytes, texts and lengths have all.
+/// The bits of a register, highest byte first, that belong to fields: the bits that
+/// [`Operation::MaskWriteRegister`](crate::modbus::rtu::Operation::MaskWriteRegister) writes. Padding has no bits;
+/// fields of more than two bytes, texts and lengths have all.
 pub fn register_bits(fields: &[FieldSpec]) -> u16 {
     let (mut bits, mut at, mut shared_at) = (0, 0_usize, 0);
     for element in fields.iter().filter_map(FieldSpec::element) {
@@ -81,7 +81,7 @@ pub fn register_bits(fields: &[FieldSpec]) -> u16 {
             return u16::MAX;
         };
         match element.encoding() {
-            // All ones.
+            // -1 sets all bits.
             Some(encoding) if element.bits().is_some() => drop(encoding.write(-1.0, own)),
             None if matches!(element, Element::Padding { .. }) => {}
             _ => own.fill(u8::MAX),
@@ -92,12 +92,12 @@ pub fn register_bits(fields: &[FieldSpec]) -> u16 {
 }
 
 impl FieldSpec {
-    /// Whether only a received frame has such a field.
+    /// Whether only received frames can have this field.
     pub(super) const fn is_input(&self) -> bool {
         matches!(self, Self::UserInput { .. } | Self::DeviceInput { .. } | Self::TextInput { .. })
     }
 
-    /// Whether a received value goes to a variable, picks a command or is an alive counter.
+    /// Whether a received value goes to a variable, selects a command or is an alive counter.
     pub fn has_value(&self) -> bool {
         match self {
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => *to != InputBinding::Unused,
@@ -106,7 +106,7 @@ impl FieldSpec {
         }
     }
 
-    /// Whether the controller's own recipes have no such field: only frames of devices have it.
+    /// Whether only frames of devices can have this field, not the controller's recipes.
     pub const fn is_device(&self) -> bool {
         match self {
             Self::UserInput { to: InputBinding::Counter { .. }, .. } => true,
@@ -125,8 +125,8 @@ impl FieldSpec {
         }
     }
 
-    /// The field as an element of a device's frame; `None` for a checksum, for what only says something of the
-    /// field before it, and for the fields of realtime recipes.
+    /// The field as an element of a device's frame. `None` for a checksum, for an entry that applies to the field
+    /// before it, and for fields of realtime recipes.
     pub const fn element(&self) -> Option<Element> {
         Some(match *self {
             Self::UserInput { ty, .. } | Self::UserOutput { ty, .. } => Element::value(Encoding::scalar(ty)),
@@ -154,10 +154,10 @@ impl FieldSpec {
     }
 }
 
-/// One frame of a part, as the configuration has it.
+/// One frame of a part in the configuration.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FrameView<'c> {
-    /// 0 in a stream recipe, else the index of the CAN frame.
+    /// 0 in a stream recipe, otherwise the index of the CAN frame.
     pub(crate) nth: u8,
     pub(crate) carrier: Carrier,
     pub(crate) delimiters: (&'c [u8], &'c [u8]),
@@ -187,8 +187,7 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// Whether a port with this recipe speaks a device's own frames, beyond what the controller's
-    /// recipes can describe.
+    /// Whether a port with this recipe uses frames beyond what the controller's recipes can describe.
     pub fn is_device(self, recipe: &Recipe) -> bool {
         recipe.exchanges.len > 0
             || recipe.repeats_ids()

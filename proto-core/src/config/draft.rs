@@ -1,8 +1,8 @@
-//! A controller, a recipe and a port as a program writes them.
+//! A controller, a recipe and a port as written in a program.
 //!
-//! In: names, numbers and slices of the caller. Out: the same, borrowed and small; every default is
-//! that of the file (docs/configuration.md). [`GatewayConfig`](super::GatewayConfig) takes them
-//! with `add_recipe` and `add_port`, in a builder or in place, and reports mistakes.
+//! In: the caller's names, numbers and slices. Out: the same, borrowed and small. All defaults are those of files
+//! (docs/configuration.md). [`GatewayConfig`](super::GatewayConfig) takes them with `add_recipe` and `add_port`, in a
+//! builder or in place, and reports errors.
 
 use super::error::ConfigErrorKind as Kind;
 use super::exchange_builder::ExchangeBuilder;
@@ -25,28 +25,28 @@ pub struct ControllerBuilder<'a> {
 }
 
 impl<'a> ControllerBuilder<'a> {
-    /// A controller with this IP address or host name, dialect `v2.3`, and ports 2000, 2001 and
-    /// 502. An empty address stands for one that is learnt otherwise.
+    /// A controller with this IP address or host name, dialect `v2.3`, and ports 2000, 2001 and 502. An empty address
+    /// means that the address is learned in another way.
     pub const fn new(address: &'a str) -> Self {
         Self { address, dialect: None, command_port: None, state_port: None, modbus_port: None }
     }
 
-    /// `"v2.3"` or `"v2.6"`; also sets the Modbus port unless [`Self::modbus_port`] was called.
+    /// Sets the dialect, `"v2.3"` or `"v2.6"`, and its Modbus port unless [`Self::modbus_port`] was called.
     pub const fn dialect(self, name: &'a str) -> Self {
         Self { dialect: Some(name), ..self }
     }
 
-    /// The command port, if it is not 2000.
+    /// Sets the command port; 2000 by default.
     pub const fn command_port(self, port: u16) -> Self {
         Self { command_port: Some(port), ..self }
     }
 
-    /// The state port, if it is not 2001.
+    /// Sets the state port; 2001 by default.
     pub const fn state_port(self, port: u16) -> Self {
         Self { state_port: Some(port), ..self }
     }
 
-    /// The Modbus port, if it is not the dialect's.
+    /// Sets the Modbus port; the dialect's by default.
     pub const fn modbus_port(self, port: u16) -> Self {
         Self { modbus_port: Some(port), ..self }
     }
@@ -70,7 +70,7 @@ pub struct RecipeBuilder<'a> {
     pub(super) exchanges: &'a [ExchangeBuilder<'a>],
 }
 
-/// What a recipe takes of the configuration's lists.
+/// Number of entries that a recipe adds to the configuration's lists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct ListDemand {
     pub(super) fields: usize,
@@ -106,7 +106,7 @@ impl Recipe {
 
     /// A recipe of user-defined fields.
     ///
-    /// It borrows its fields, so it is written where it is added:
+    /// It borrows its fields, so write it in the call that adds it:
     ///
     /// ```
     /// use proto_core::config::{CanFields, GatewayConfig, InputField, OutputField, Port, Recipe};
@@ -149,21 +149,20 @@ impl<'a> RecipeBuilder<'a> {
         Self { name, mode, input, output, on_stale, trigger, exchanges: &[] }
     }
 
-    /// The input part (user to robot) as a stream: head, tail, at most 8 bytes each, and the
-    /// fields.
+    /// Sets the input part (user to robot) of a stream: head and tail of at most 8 bytes each, and the fields.
     pub fn stream_input(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
         self.input = PartFields::stream(head, tail, fields.into());
         self
     }
 
-    /// The output part (robot to user) as a stream.
+    /// Sets the output part (robot to user) of a stream.
     pub fn stream_output(mut self, head: &'a [u8], tail: &'a [u8], fields: impl Into<Fields<'a>>) -> Self {
         self.output = PartFields::stream(head, tail, fields.into());
         self
     }
 
-    /// What tells the frames of a stream part apart, if it is not their fields; of a user-defined recipe. No effect on
-    /// other parts.
+    /// Sets how the frames of a stream part are separated, if not by their fields. For user-defined recipes; no effect
+    /// on other parts.
     pub fn framing(mut self, part: Direction, boundary: Boundary, escape: Option<Escape>) -> Self {
         let part = if part == Direction::Input { &mut self.input } else { &mut self.output };
         if let PartFields::Stream { ends, .. } = part {
@@ -172,38 +171,38 @@ impl<'a> RecipeBuilder<'a> {
         self
     }
 
-    /// The input part (user to robot) as CAN frames.
+    /// Sets the input part (user to robot) as CAN frames.
     pub const fn can_input(mut self, frames: &'a [CanFields<'a>]) -> Self {
         self.input = PartFields::Can(frames);
         self
     }
 
-    /// The output part (robot to user) as CAN frames.
+    /// Sets the output part (robot to user) as CAN frames.
     pub const fn can_output(mut self, frames: &'a [CanFields<'a>]) -> Self {
         self.output = PartFields::Can(frames);
         self
     }
 
-    /// What is asked of devices beside the parts, or all that a recipe of Modbus has; see [`ExchangeBuilder`]. Of a
-    /// user-defined recipe.
+    /// Sets the exchanges with devices besides the parts, or instead of parts for Modbus; see [`ExchangeBuilder`]. For
+    /// user-defined recipes.
     pub const fn exchanges(mut self, exchanges: &'a [ExchangeBuilder<'a>]) -> Self {
         self.exchanges = exchanges;
         self
     }
 
-    /// What a port does while the sources of its output are stale.
+    /// Sets what a port does while the sources of its output are stale.
     pub const fn on_stale(mut self, on_stale: OnStale) -> Self {
         self.on_stale = on_stale;
         self
     }
 
-    /// What makes a port send the output part.
+    /// Sets what makes a port send the output part.
     pub const fn send(mut self, send: SendOn) -> Self {
         self.trigger = DraftTrigger::On(send);
         self
     }
 
-    /// The output part is sent when this bit, 0..=7, of a bit variable goes from 0 to 1.
+    /// Sends the output part when this bit, 0..=7, of a bit variable changes from 0 to 1.
     pub fn send_on_rising(mut self, var: impl Into<Var<'a>>, bit: u8) -> Self {
         self.trigger = DraftTrigger::Rising(var.into(), bit);
         self
@@ -255,7 +254,7 @@ pub struct Listen<'a> {
     address: &'a str,
 }
 
-/// The bus of a [`PortBuilder`] of Modbus RTU: a line with its silences, where none are set.
+/// The bus of a [`PortBuilder`] for Modbus RTU: a serial line, with the silences of Modbus RTU unless set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RtuLine {
     line: Rs485,
@@ -269,7 +268,7 @@ impl RtuLine {
     }
 }
 
-/// The bus of a [`PortBuilder`] over Modbus TCP: where the device, or its gateway, is.
+/// The bus of a [`PortBuilder`] for Modbus TCP: address of the device, or of its gateway.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ModbusTcp<'a> {
     host: &'a str,
@@ -280,8 +279,7 @@ pub struct ModbusTcp<'a> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Can(u32);
 
-/// The safe values of a port: `&[("DigitalOutputCommand[1]", 0.0)]`, the same with variables, or
-/// `&[SafeValue]`.
+/// The safe values of a port: `&[("DigitalOutputCommand[1]", 0.0)]`, the same with variables, or `&[SafeValue]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum SafeValues<'a> {
@@ -322,7 +320,7 @@ macro_rules! safe_values_from {
 safe_values_from! { (&'a str, f64) => Names, (SysVar, f64) => Vars, SafeValue => Values }
 
 impl Port {
-    /// A port on a bus as the configuration has it.
+    /// A port on a bus in the configuration's form.
     pub const fn on<'a>(name: &'a str, recipe: &'a str, bus: Bus) -> PortBuilder<'a, Bus> {
         PortBuilder::new(name, recipe, bus)
     }
@@ -332,20 +330,20 @@ impl Port {
         PortBuilder::new(name, recipe, Rs485::default())
     }
 
-    /// A serial line of which the gateway is the Modbus RTU master, for a recipe with such exchanges.
-    /// The turnaround is 3.5 characters, or 1750 µs above 19 200 bit/s, unless it is set.
+    /// A serial line with the gateway as Modbus RTU master, for a recipe with Modbus exchanges. The default turnaround
+    /// is 3.5 characters, or 1750 µs above 19 200 bit/s.
     pub fn modbus_rtu<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, RtuLine> {
         PortBuilder::new(name, recipe, RtuLine::new(false))
     }
 
-    /// A serial line on which the gateway is a Modbus RTU slave, for a recipe with such blocks. Idle gap
-    /// and turnaround are 3.5 characters, or 1750 µs above 19 200 bit/s, unless they are set.
+    /// A serial line with the gateway as Modbus RTU slave, for a recipe with Modbus blocks. Idle gap and turnaround are
+    /// 3.5 characters by default, or 1750 µs above 19 200 bit/s.
     pub fn modbus_rtu_slave<'a>(name: &'a str, recipe: &'a str) -> PortBuilder<'a, RtuLine> {
         PortBuilder::new(name, recipe, RtuLine::new(true))
     }
 
-    /// Devices of which the gateway is the Modbus TCP client, for a recipe of a Modbus master; by default at TCP port 502
-    /// of `host`, an IP address or a name.
+    /// Devices with the gateway as Modbus TCP client, for a recipe of a Modbus master; by default at TCP port 502 of
+    /// `host`, an IP address or a name.
     pub const fn modbus_tcp<'a>(
         name: &'a str,
         recipe: &'a str,
@@ -396,51 +394,51 @@ impl<'a, B> PortBuilder<'a, B> {
         }
     }
 
-    /// The cycle: how often the output part is sent, 4 ms to an hour.
+    /// Sets the cycle in which the output part is sent: 4 ms to an hour.
     pub fn cycle(mut self, cycle: Duration) -> Self {
         self.cycle = Some(cycle);
         self
     }
 
-    /// The timeout: after this long without an accepted frame the port's inputs take their safe
-    /// values; [`Port::NEVER`](super::Port::NEVER) for a device that sends only events.
+    /// Sets the timeout: after this time without an accepted frame the port's inputs take their safe values.
+    /// [`Port::NEVER`](super::Port::NEVER) for a device that sends only on events.
     pub fn timeout(mut self, timeout: Duration) -> Self {
         self.timeout = Some(timeout);
         self
     }
 
-    /// Outputs whose source is older than this are stale.
+    /// Sets the age of a source from which on outputs are stale.
     pub fn stale_after(mut self, stale_after: Duration) -> Self {
         self.stale_after = Some(stale_after);
         self
     }
 
-    /// The safe values; other variables hold. Refused on listening ports, which own no variable.
+    /// Sets the safe values; other variables hold. Refused on listening ports, which own no variable.
     pub fn safe(mut self, values: impl Into<SafeValues<'a>>) -> Self {
         self.safe = values.into();
         self
     }
 
-    /// The safe values hold from the start, until the device speaks.
+    /// Applies the safe values from the start until the device sends a frame.
     pub fn safe_at_start(mut self) -> Self {
         self.safe_at_start = true;
         self
     }
 
-    /// A recipe that is sent on change is also sent after this long without a change.
+    /// Also sends a recipe that is sent on change after this time without a change.
     pub fn refresh(mut self, refresh: Duration) -> Self {
         self.refresh = Some(refresh);
         self
     }
 
-    /// A peer of the recipe's exchanges that was not heard for this long has started anew when it is heard again; 3 s
-    /// by default.
+    /// Sets the time without a frame after which a peer of the recipe's exchanges counts as restarted when it is heard
+    /// again; 3 s by default.
     pub fn absent(mut self, absent: Duration) -> Self {
         self.absent = Some(absent);
         self
     }
 
-    /// The variables that tell the robot the port's health. Refused on listening ports.
+    /// Sets the variables that report the port's health to the robot. Refused on listening ports.
     pub fn health(mut self, health: PortHealth) -> Self {
         self.health = health;
         self
@@ -448,37 +446,37 @@ impl<'a, B> PortBuilder<'a, B> {
 }
 
 impl<B: SerialLine> PortBuilder<'_, B> {
-    /// Bit/s, 1200..=4_000_000.
+    /// Sets the bit rate, 1200..=4_000_000 bit/s.
     pub fn baud(mut self, baud: u32) -> Self {
         self.bus.line().baud = baud;
         self
     }
 
-    /// The parity bit.
+    /// Sets the parity.
     pub fn parity(mut self, parity: Parity) -> Self {
         self.bus.line().parity = parity;
         self
     }
 
-    /// Stop bits, 1 or 2.
+    /// Sets the number of stop bits, 1 or 2.
     pub fn stop_bits(mut self, stop_bits: u8) -> Self {
         self.bus.line().stop_bits = stop_bits;
         self
     }
 
-    /// A partial frame is discarded after this silence: above 0, at most 1 s.
+    /// Discards a partial frame after this silence: above 0, at most 1 s.
     pub fn idle_gap(mut self, idle_gap: Duration) -> Self {
         self.bus.line().idle_gap = idle_gap;
         self
     }
 
-    /// The silence before the port sends, at most 1 s; on a line of Modbus RTU above 0.
+    /// Sets the silence before the port sends: at most 1 s; on Modbus RTU above 0.
     pub fn turnaround(mut self, turnaround: Duration) -> Self {
         self.bus.line().turnaround = turnaround;
         self
     }
 
-    /// Whether what is sent is heard as well; learned by default. [`Echo::Yes`] only with a recipe of exchanges.
+    /// Sets whether sent bytes are also received; learned by default. [`Echo::Yes`] only with a recipe of exchanges.
     pub fn echo(mut self, echo: Echo) -> Self {
         self.bus.line().echo = echo;
         self
@@ -486,7 +484,7 @@ impl<B: SerialLine> PortBuilder<'_, B> {
 }
 
 impl PortBuilder<'_, Can> {
-    /// Bit/s, 10_000..=1_000_000.
+    /// Sets the bit rate, 10_000..=1_000_000 bit/s.
     pub fn bitrate(mut self, bitrate: u32) -> Self {
         self.bus.0 = bitrate;
         self
@@ -494,7 +492,7 @@ impl PortBuilder<'_, Can> {
 }
 
 impl PortBuilder<'_, ModbusTcp<'_>> {
-    /// The TCP port.
+    /// Sets the TCP port.
     pub fn tcp_port(mut self, port: u16) -> Self {
         self.bus.port = port;
         self
@@ -519,12 +517,12 @@ impl PortBus for Listen<'_> {}
 pub(super) mod sealed {
     use super::{Bus, Can, Duration, Kind, Listen, ModbusTcp, Rs485, RtuLine, text};
 
-    /// Buses are those of the configuration.
+    /// Conversion to a bus of the configuration.
     pub trait Sealed {
-        /// The bus in the configuration.
+        /// The bus of the configuration.
         ///
         /// # Errors
-        /// What is wrong with it: an address that is too long.
+        /// The error in it: an address that is too long.
         fn bus(&self) -> Result<Bus, Kind>;
     }
 
@@ -552,9 +550,9 @@ pub(super) mod sealed {
         }
     }
 
-    /// Serial lines have settings.
+    /// Buses that are serial lines.
     pub trait SerialBus {
-        /// The settings.
+        /// The settings of the line.
         fn line(&mut self) -> &mut Rs485;
     }
 
