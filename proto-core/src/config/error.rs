@@ -1,4 +1,4 @@
-//! What can be wrong with a configuration, and where.
+//! Errors in a configuration, and their places.
 
 use core::net::Ipv4Addr;
 
@@ -14,7 +14,7 @@ use crate::time::Duration;
 use crate::wire::can::CanId;
 use crate::wire::scalar::{ScalarError, ScalarType};
 
-/// The first mistake that [`ConfigView::validate`](super::ConfigView::validate) found.
+/// The first error that [`ConfigView::validate`](super::ConfigView::validate) found.
 ///
 /// Its `Display` counts recipes and ports from 1; [`ConfigView::describe`](super::ConfigView::describe) names them.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,7 +25,7 @@ pub struct ConfigError {
     pub kind: ConfigErrorKind,
 }
 
-/// A place in a configuration. Numbers are indices, from 0.
+/// A place in a configuration. Numbers are indices from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Place {
@@ -64,8 +64,8 @@ pub enum Place {
         recipe: u8,
         /// Input or output part.
         part: Direction,
-        /// Index of the CAN frame in the part; 0 in a stream recipe. The frames of exchanges are counted
-        /// on behind those of the part.
+        /// Index of the CAN frame in the part; 0 in a stream recipe. The frames of exchanges are counted after those of
+        /// the part.
         frame: u8,
         /// Index of the field in the part or frame.
         field: u8,
@@ -76,7 +76,7 @@ pub enum Place {
         recipe: u8,
         /// Index of the exchange in the recipe.
         exchange: u8,
-        /// What about it.
+        /// The key.
         key: ExchangeKey,
     },
     /// One entry of a command table.
@@ -124,13 +124,13 @@ pub enum Counted {
     RecipeLinks,
     /// User-defined fields of all field ports in one direction.
     UserFields,
-    /// User-defined fields that pick commands.
+    /// User-defined fields that select commands.
     CommandFields,
     /// Bytes of all command texts.
     CommandBytes,
-    /// Frames of one port with a device's own frames.
+    /// Frames of one port that are a device's own.
     DeviceFrames,
-    /// Bytes of whose bits an input frame writes some, over all input frames.
+    /// Bytes of which input frames write single bits, over all input frames.
     BitShares,
     /// Texts of one port.
     Texts,
@@ -140,13 +140,13 @@ pub enum Counted {
     Groups,
     /// Blocks of neighbouring variables that are polled by Modbus.
     PollBlocks,
-    /// Values of the state packet and of the health of ports that all ports send.
+    /// Values of the state packet and of the health of ports, over all ports that send them.
     Sources,
     /// Exchanges of all recipes.
     Exchanges,
     /// Frames of all exchanges.
     ExchangeFrames,
-    /// Pieces of 32 bytes that the blocks need which masters write.
+    /// Pieces of 32 bytes for the blocks that masters write.
     WrittenPieces,
 }
 
@@ -184,38 +184,38 @@ impl core::fmt::Display for Counted {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum ConfigErrorKind {
-    /// There is no dialect of this name.
+    /// There is no dialect with this name.
     UnknownDialect,
     /// A port number of the controller is 0.
     ZeroPort,
-    /// A prefix that leaves no room for hosts, or is not a prefix.
+    /// A network prefix that is invalid or has no host addresses.
     Prefix {
         /// The prefix.
         prefix: u8,
     },
-    /// The address cannot be that of a host in the board's network.
+    /// The address cannot be a host's in the board's network.
     NoHostAddress {
         /// The address.
         address: Ipv4Addr,
         /// The board's network.
         network: Network,
     },
-    /// The board's own address, where that of another host is required.
+    /// The address is the board's own, but must be another host's.
     OwnAddress,
-    /// The address is in another network, and no router is configured.
+    /// The address is in another network, but no router is configured.
     NeedsRouter {
         /// The address.
         address: Ipv4Addr,
         /// The board's network.
         network: Network,
     },
-    /// The controller is configured by name, and no name server is configured.
+    /// The controller is configured by name, but no name server is configured.
     NeedsDns,
     /// There is no recipe with this index.
     NoSuchRecipe {
         /// The index.
         recipe: u8,
-        /// How many recipes there are.
+        /// Number of recipes.
         recipes: u8,
     },
     /// A range of fields, commands or safe values ends beyond its list.
@@ -225,20 +225,20 @@ pub enum ConfigErrorKind {
         /// The length of the list.
         len: u32,
     },
-    /// More entries than there is room for in this type of configuration, or in any.
+    /// More entries than this type of configuration, or any, can hold.
     TooMany {
         /// The list.
         what: Counted,
         /// Number of entries needed.
         needed: usize,
-        /// Number of entries there is room for.
+        /// Number of entries that fit.
         room: usize,
     },
     /// A text or a delimiter is too long.
     TooLong {
         /// Its length in bytes.
         len: usize,
-        /// The longest that is allowed, in bytes.
+        /// Maximum length in bytes.
         longest: usize,
     },
     /// A name is empty or too long.
@@ -253,7 +253,7 @@ pub enum ConfigErrorKind {
     },
     /// No earlier recipe has this name.
     NoSuchName,
-    /// The name is not that of a system variable.
+    /// No system variable has this name.
     Variable(VarError),
     /// One part of a recipe is a stream and the other CAN.
     MixedParts,
@@ -277,7 +277,7 @@ pub enum ConfigErrorKind {
     RealtimeSendsByPeriod,
     /// A trigger, but no output part to send.
     NothingToSend,
-    /// Sent for each input frame, but there is no input part.
+    /// The output part is sent for each input frame, but there is no input part.
     NoInputToAnswer,
     /// A scale is 0 or not finite, or an offset is not finite.
     BadScale {
@@ -286,27 +286,27 @@ pub enum ConfigErrorKind {
         /// Offset.
         offset: f32,
     },
-    /// A constant does not fit in its field, or a safe value in its variable.
+    /// A constant does not fit its field, or a safe value its variable.
     Constant(ScalarError),
     /// This use needs a field of an integer type.
     NeedsInteger {
         /// The field's type.
         ty: ScalarType,
     },
-    /// The frame of a device cannot be laid out.
+    /// The frame of a device has an invalid layout.
     Layout(LayoutError),
-    /// The exchange cannot be.
+    /// The exchange is invalid.
     Exchange(ExchangeError),
     /// The range of an alive counter.
     Counter {
         /// Its highest number.
         max: u32,
-        /// The highest number of the field; below 0 if it is none of unsigned integers.
+        /// The highest number of the field; negative if its type is not an unsigned integer.
         high: f64,
     },
-    /// An echo is told from replies in exchanges only.
+    /// An echo can be told from replies only with exchanges.
     EchoNeedsExchanges,
-    /// A number that its field cannot have.
+    /// The field cannot have this number.
     NotInField {
         /// The number.
         value: f64,
@@ -315,19 +315,19 @@ pub enum ConfigErrorKind {
         /// The largest.
         high: f64,
     },
-    /// This use needs a field that has integers only.
+    /// This use needs a field that can only have integers.
     NeedsIntegers,
     /// Only integers wrap around.
     OnlyIntegersWrap,
-    /// Limits or an entry of a table stand behind no output field with a source.
+    /// Limits or a table entry do not follow an output field that has a source.
     NothingToLimit,
-    /// Limits, a table or a rule stand behind no input field that writes a variable as a whole.
+    /// Limits, a table or a rule do not follow an input field that writes a variable as a whole.
     NothingToRule,
-    /// A field has the same rule twice, or one after the table that it changes.
+    /// A field has the same rule twice, or a rule after the table that it changes.
     RuleTwice,
-    /// What becomes of all other values, without a table.
+    /// `Else` without a table.
     ElseWithoutMap,
-    /// A number that its variable cannot have.
+    /// The variable cannot have this number.
     NotInVariable {
         /// The variable.
         var: SysVar,
@@ -339,62 +339,62 @@ pub enum ConfigErrorKind {
         /// The variable.
         var: SysVar,
     },
-    /// A text can only stand for no value where digits stand.
+    /// A text for "no value" in a field that is not digits.
     NoTextNeedsDigits,
-    /// A comma is for decimal digits that it does not end.
+    /// A comma as decimal point in a field that is not decimal digits or ends with a comma.
     NoComma,
-    /// A field that wraps has limits or a table.
+    /// A field that wraps also has limits or a table.
     LimitsAndWrap,
     /// A field has limits twice, or limits and a table.
     LimitsAndMap,
-    /// A count wraps, and has neither limits nor a table.
+    /// A count has limits or a table, although it wraps.
     LimitedCount,
-    /// A table takes the values of the source as they are.
+    /// A field with a table has a scale or offset; tables use the values of the source unchanged.
     ScaledMap,
-    /// The limits of a field run backwards.
+    /// The lower limit of a field exceeds the upper one.
     BackwardLimits {
         /// The lowest number.
         low: f64,
         /// The highest number.
         high: f64,
     },
-    /// A number with a fraction, where its field has integers only.
+    /// A number with a fraction for a field that can only have integers.
     FractionOfInteger {
         /// The number.
         value: f64,
     },
-    /// A number with more digits behind the point than its field has.
+    /// A number with more digits after the point than its field has.
     TooManyDecimals {
         /// The number.
         value: f64,
         /// Digits of the field.
         decimals: u8,
     },
-    /// An earlier entry of the table has the value.
+    /// An earlier entry of the table has this value.
     MappedTwice {
         /// The value.
         value: i64,
     },
     /// No checksum has this name.
     UnknownChecksum,
-    /// A text, its length or its count needs so many word variables that follow each other.
+    /// A text, its length or its count needs this many consecutive word variables.
     NotWords {
         /// The first variable.
         var: SysVar,
         /// Number of variables.
         count: u8,
     },
-    /// A word has two characters, so their order is little or big.
+    /// The byte order of a text is neither little nor big; a word has two characters.
     TextOrder,
-    /// Frames that are told apart by something else than their fields, in a realtime recipe.
+    /// A realtime recipe whose frames are separated by something else than their fields.
     FramingNeedsUser,
-    /// Escape bytes and something else tell frames apart.
+    /// Frames are separated both by escape bytes and in another way.
     TwoFramings,
-    /// Frames are told apart by a tail that the part does not have.
+    /// Frames are separated by a tail, which the part does not have.
     NoTail,
     /// A command table has no entries.
     EmptyTable,
-    /// The field can never have a command's value.
+    /// The field can never have the value of a command.
     CommandValue {
         /// The value.
         value: i64,
@@ -422,17 +422,17 @@ pub enum ConfigErrorKind {
         /// The bit.
         bit: VarBit,
     },
-    /// A recipe writes a variable as a whole and one of its bits.
+    /// A recipe writes a variable as a whole and also one of its bits.
     WholeAndBit {
         /// The bit.
         bit: VarBit,
     },
-    /// Only variables made of bits have bits.
+    /// The variable does not consist of bits.
     HasNoBits {
         /// The variable.
         var: SysVar,
     },
-    /// Input fields write input variables only.
+    /// An input field writes a variable that is not an input.
     NotAnInput {
         /// The variable.
         var: SysVar,
@@ -442,7 +442,7 @@ pub enum ConfigErrorKind {
         /// The variable.
         var: SysVar,
     },
-    /// A trigger needs a variable made of bits.
+    /// A trigger needs a variable that consists of bits.
     NotBits {
         /// The variable.
         var: SysVar,
@@ -476,7 +476,7 @@ pub enum ConfigErrorKind {
     },
     /// A time that must be positive is 0.
     ZeroTime,
-    /// A time is longer than makes sense.
+    /// A time is longer than allowed.
     TimeTooLong {
         /// The time.
         time: Duration,
@@ -488,7 +488,7 @@ pub enum ConfigErrorKind {
         /// Index of the recipe.
         recipe: u8,
     },
-    /// Another recipe than that of a Modbus master on a port of Modbus TCP.
+    /// A recipe other than a Modbus master's on a Modbus TCP port.
     NeedsModbusMaster {
         /// Index of the recipe.
         recipe: u8,
@@ -498,12 +498,12 @@ pub enum ConfigErrorKind {
         /// Index of the recipe.
         recipe: u8,
     },
-    /// A user-defined recipe where the controller knows realtime ones only (D16).
+    /// A user-defined recipe where the controller supports only realtime ones (D16).
     NeedsRealtimeRecipe {
         /// Index of the recipe.
         recipe: u8,
     },
-    /// Not an address and port to listen on.
+    /// The text is not an address and port to listen on.
     ListenAddress,
     /// An earlier port listens on the same address and port.
     ListenTwice {
@@ -524,14 +524,14 @@ pub enum ConfigErrorKind {
         /// Index of the earlier port.
         other: u8,
     },
-    /// One port writes the whole variable, and the other one of its bits.
+    /// One port writes the whole variable, and another one a bit of it.
     OwnedAndShared {
         /// The bit.
         bit: VarBit,
         /// Index of the other port.
         other: u8,
     },
-    /// A port writes a variable that no configured way up can carry (D15).
+    /// A port writes a variable that no configured route can carry (D15).
     NoRoute {
         /// The variable.
         var: SysVar,
@@ -545,8 +545,7 @@ pub enum ConfigErrorKind {
         /// Index of the port.
         port: u8,
     },
-    /// A way up carries a variable that no port owns and that cannot be read back, so its value is
-    /// not known.
+    /// A route carries a variable that no port owns and that cannot be read back, so its value is unknown.
     Unowned {
         /// The variable.
         var: SysVar,
@@ -556,14 +555,14 @@ pub enum ConfigErrorKind {
         /// The variable.
         var: SysVar,
     },
-    /// A safe value for bits that the port does not write one by one.
+    /// A safe value for bits that the port does not write individually.
     BitsNotOwned {
         /// The variable.
         var: SysVar,
         /// Its bits.
         mask: u8,
     },
-    /// A safe value's type is not its variable's.
+    /// The type of a safe value differs from its variable's.
     SafeType {
         /// The variable.
         var: SysVar,
@@ -580,49 +579,49 @@ pub enum ConfigErrorKind {
         /// The variable.
         var: SysVar,
     },
-    /// The text of a command is not a request of port 2000 with one of its values.
+    /// The text of a command is not a request of port 2000 with this value inserted.
     CommandFor {
         /// The value.
         value: i64,
         /// What is wrong with the text.
         error: ParseError,
     },
-    /// The values of a command run backwards.
+    /// The first value of a command exceeds the last one.
     BackwardRange {
         /// The first value.
         first: i64,
         /// The last value.
         last: i64,
     },
-    /// The controller's state packet has no such value.
+    /// The state packet has no such value.
     StateValue(StateValueError),
     /// There is no field port with this index.
     NoFieldPort {
         /// The index.
         port: u8,
     },
-    /// There is no such link: no UDP server of recipes is configured, or the port does not listen.
+    /// The link does not exist: no recipe link is configured, or the port does not listen.
     NoLink {
         /// The link.
         link: LinkSource,
     },
-    /// Counts have no scale and offset: they wrap.
+    /// Counts wrap, so they cannot have scale and offset.
     ScaledCount,
-    /// The variable cannot tell the health of a port.
+    /// The variable cannot report the health of a port.
     NotForHealth {
         /// The variable.
         var: SysVar,
     },
-    /// The port itself writes the variable, from its frames or as another value of its health.
+    /// The port already writes the variable, from its frames or for another value of its health.
     HealthTwice {
         /// The variable.
         var: SysVar,
     },
     /// Only field ports have this key.
     OnlyFieldPorts,
-    /// Safe values at the start, but the port has no safe values.
+    /// The port has no safe values to apply at the start.
     NoSafeValues,
-    /// Only a recipe that is sent on change is refreshed.
+    /// A refresh for a recipe that is not sent on change.
     OnlyChangesRefresh,
 }
 
@@ -632,112 +631,111 @@ pub enum ConfigErrorKind {
 pub enum ExchangeError {
     /// The recipe is realtime.
     NeedsUser,
-    /// Modbus master, Modbus slave and frames of a device's own are mixed in one recipe.
+    /// One recipe mixes Modbus master, Modbus slave and a device's own frames.
     Mixed,
-    /// What tells the frames of a part apart is not their fields: replies could not be found.
+    /// The frames of a part are separated by something else than their fields, so replies cannot be found.
     CutParts,
-    /// A recipe of Modbus has parts.
+    /// A Modbus recipe has parts.
     PartsBesideModbus,
-    /// A frame for a line in a CAN recipe, or one with an id in a stream recipe.
+    /// A frame without an id in a CAN recipe, or with an id in a stream recipe.
     WrongBus,
-    /// The slave's address.
+    /// An invalid slave address.
     Slave {
         /// The address.
         address: u8,
     },
-    /// The address of the gateway as a slave.
+    /// An invalid address for the gateway as a slave.
     OwnAddress {
         /// The address.
         address: u8,
     },
-    /// Blocks of one slave with different addresses.
+    /// Blocks of one slave have different addresses.
     OtherAddress,
-    /// Registers or coils behind the last one.
+    /// Registers or coils after the last one.
     BeyondLast {
-        /// The first of them.
+        /// The first address.
         address: u16,
-        /// How many there are.
+        /// Their number.
         count: u16,
     },
-    /// A broadcast that reads: nobody would answer.
+    /// A broadcast read, which nobody would answer.
     BroadcastRead,
-    /// A write to all slaves over Modbus TCP, which has no broadcast.
+    /// A broadcast over Modbus TCP, which has none.
     BroadcastOverTcp,
     /// A field of coils that is not one bit.
     NotCoils,
-    /// More slaves or other peers than one port can have.
+    /// More slaves or other peers than allowed on one port.
     TooManyPeers,
-    /// The count of registers or coils.
+    /// An invalid count of registers or coils.
     Count(CountError),
     /// The fields do not fill their registers or coils.
     Fields {
-        /// The bytes of the registers or coils.
+        /// Number of bytes of the registers or coils.
         needed: usize,
-        /// The bytes of the fields.
+        /// Number of bytes of the fields.
         found: usize,
     },
-    /// The fields have no fixed length.
+    /// A field of varying length.
     Varying,
-    /// The fields are not the bits that the mask names, or are none, or all of the register.
+    /// The fields are not the bits of the mask, or are no bits or all bits of the register.
     Mask,
-    /// An operation that a slave does not serve.
+    /// An operation that the gateway does not serve as a slave.
     NotServed,
-    /// Registers or coils that another block has.
+    /// The registers or coils overlap those of another block.
     Overlap,
-    /// Neither request nor reply.
+    /// Neither a request nor a reply.
     Nothing,
-    /// A pending answer or a refusal without a request and its reply.
+    /// A pending answer or a refusal needs a request and its reply.
     LoneRefusal,
-    /// A request that is never sent.
+    /// The request has no trigger.
     Never,
-    /// A reply that comes unasked has a time at which it is asked.
+    /// An unsolicited reply has triggers.
     Unasked,
-    /// A remote request with fields.
+    /// A remote request has fields.
     RemoteFields,
-    /// A remote frame that the gateway would receive.
+    /// A received frame is a remote frame.
     RemoteReply,
-    /// A pending answer or a refusal with commands or an alive counter.
+    /// A pending answer or a refusal has commands or an alive counter.
     RefusalValues,
-    /// A pending answer or a refusal whose frames are all taken for an answer that is looked for first.
+    /// A pending answer or a refusal whose frames always match another answer that is checked first.
     Hidden,
-    /// A pending answer that may have the bytes of its request, as an echo has.
+    /// A pending answer may equal its request, like an echo.
     PendingEcho,
-    /// Nothing is asked at the start of the peer, so its restart means nothing; or there is no reply.
+    /// A sign of a restart without requests at the start, or without a reply.
     RestartedNothing,
-    /// The field that tells of a restart is none with a number in the reply.
+    /// The field that shows a restart is not one with a number in the reply.
     RestartedField {
         /// The field, counted from 0.
         field: u8,
     },
-    /// A frame with the id of another one that can come at the same time, and no constant that tells
-    /// them apart.
+    /// A frame has the same id as another one that may arrive at the same time, and no constant tells them apart.
     Indistinguishable {
         /// Their id.
         id: CanId,
     },
-    /// More CAN ids of received frames than one port can have.
+    /// More CAN ids of received frames than allowed on one port.
     TooManyIds,
-    /// The time in which an event may be sent.
+    /// An invalid time in which an event may be sent.
     Trigger {
         /// The time.
         time: Duration,
     },
-    /// A time or outcome of events of an exchange that no event asks.
+    /// A time or outcome of events, but the exchange has no events.
     NoEvent,
-    /// A write that stops its peer and that nothing confirms.
+    /// A write that stops its peer, but has no confirmation.
     StopNeedsReply,
-    /// An exchange that follows itself, or one that the recipe does not have.
+    /// An exchange that follows itself, or a missing exchange.
     FollowsNothing {
-        /// The exchange that it names, counted from 0.
+        /// The exchange to follow, counted from 0.
         follow: u8,
     },
-    /// An exchange that follows one without a reply.
+    /// An exchange that follows another one without a reply.
     FollowsUnanswered,
-    /// An exchange that follows another and has a rising bit of its own, or stops its peer.
+    /// An exchange that follows another one and also has a rising bit or stops its peer.
     FollowsAndRises,
-    /// Exchanges that follow each other in a circle.
+    /// Exchanges follow each other in a circle.
     FollowsCircle,
-    /// A variable that cannot tell what became of an event.
+    /// The variable cannot report the outcome of an event.
     NotForOutcome {
         /// The variable.
         var: SysVar,

@@ -1,7 +1,7 @@
-//! Exchanges as the configuration has them: what is asked, what is expected as the reply, and when.
+//! Exchanges in the configuration: requests, expected replies, and triggers.
 //!
-//! Plain data: nothing here has been checked. A recipe has a range of the configuration's exchanges
-//! beside its parts; their frames are ranges of the same list of fields.
+//! Plain data: nothing here is checked. Besides its parts, a recipe has a range of the configuration's exchanges; the
+//! fields of their frames are in the common list of fields.
 
 use super::{Delimiter, FieldSpec, Span};
 use crate::device::{Element, Encoding};
@@ -10,63 +10,63 @@ use crate::sysvar::{Direction, SysVar};
 use crate::time::Duration;
 use crate::wire::can::CanId;
 
-/// A request that the gateway sends and the reply that it expects; or one that it answers.
+/// A request that the gateway sends, with the expected reply; or one that it answers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Exchange {
-    /// The slave's address on Modbus (0: all of them), or a number of the device. The exchanges of one
-    /// peer share what is known of it: one that does not answer is asked less often.
+    /// The slave's address on Modbus (0: broadcast), or a number of the device. Exchanges of the same peer share its
+    /// availability: a peer that does not answer is asked less often.
     pub peer: u8,
     /// The frames.
     pub transaction: Transaction,
-    /// When it is asked.
+    /// When the request is sent.
     pub when: Triggers,
-    /// How long the reply may take, from the end of the request to the end of the reply.
+    /// Maximum time from the end of the request to the end of the reply.
     pub timeout: Duration,
-    /// How often a request without a good reply is repeated at once: a period, or a value that is written until the
-    /// device has it.
+    /// Maximum number of immediate repetitions of a periodic request, or of a value that is written until the device
+    /// has it, if there is no good reply.
     pub retries: u8,
-    /// The same for an event: a rise, a step that follows one, or what is only asked at the start. A device may carry
-    /// out twice what is repeated.
+    /// Maximum number of repetitions of an event: a rising bit, an exchange that follows another, or one sent only at
+    /// the start. The device may execute it twice.
     pub event_retries: u8,
-    /// How long the line rests after it.
+    /// Pause on the line after the exchange.
     pub pause: Duration,
-    /// How long after an event its request may still be sent; `None` is the timeout of the port, at most
+    /// How long after an event its request may still be sent. `None` is the timeout of the port, at most
     /// [`MAX_TRIGGER`].
     pub trigger: Option<Duration>,
-    /// How long after its request a reply may come, which is late after [`Self::timeout`]. Until then nothing is asked
-    /// of the peer whose reply could be taken for it. `None` is three times the timeout, at least
+    /// How long after its request a late reply may arrive, which comes after [`Self::timeout`]. Until then, requests to
+    /// the peer with replies that could be confused with it wait. `None` is three times the timeout, at least
     /// [`DEFAULT_LATE`].
     pub late: Option<Duration>,
-    /// It stops its peer: it goes first, cancels the peer's events, and is repeated until it is confirmed.
+    /// The exchange stops its peer: it is sent first, cancels the peer's events, and is repeated until confirmed.
     pub stop: bool,
-    /// The exchange of the recipe, counted from 0, after whose good answer this one is sent.
+    /// The exchange of the recipe, counted from 0, after whose good reply this one is sent.
     pub follow: Option<u8>,
-    /// When the values of the reply are overdue; `None` is the timeout of the port, [`Port::NEVER`](super::Port::NEVER)
-    /// is never, for a reply that comes only when something happens.
+    /// When the values of the reply are overdue. `None` is the timeout of the port; [`Port::NEVER`](super::Port::NEVER)
+    /// is for a reply that is sent only on events.
     pub overdue: Option<Duration>,
-    /// The variables that tell the robot what became of its events.
+    /// The variables that report the outcome of the exchange's events to the robot.
     pub outcome: OutcomeTo,
-    /// The frame of a device's own that says that it is at it and that its answer follows, as an index into
+    /// A device's frame saying that the request is in progress and the answer follows, as an index into
     /// [`GatewayConfig::frames`](super::GatewayConfig::frames).
     pub pending: Option<u8>,
-    /// What in its reply tells that the peer has restarted.
+    /// The sign of a restart of the peer in the reply.
     pub restarted: Option<Restarted>,
 }
 
-/// A number of a reply that tells that the peer has restarted, when the reply before had another one there.
+/// A number in a reply that shows a restart of the peer, if the previous reply had another number there.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Restarted {
-    /// The field of the reply that has it, counted from 0: values and constants, without padding and texts.
+    /// The reply's field with the number, counted from 0 without padding and texts.
     pub field: u8,
     /// The number, before scale and offset.
     pub value: f64,
 }
 
 impl Restarted {
-    /// The field in a reply with these fields: its place among those with an element, and its encoding; `None` if it is
-    /// none with a number that may vary.
+    /// The index of the field among those with an element, and its encoding. `None` if it does not have a variable
+    /// number.
     pub(crate) fn place(&self, fields: &[FieldSpec]) -> Option<(u8, Encoding)> {
         let numbers =
             (0_u8..).zip(fields.iter().filter_map(FieldSpec::element)).filter_map(|(nth, element)| {
@@ -81,7 +81,7 @@ impl Restarted {
     }
 }
 
-/// The variables that tell the robot what became of an exchange's events.
+/// The variables that report the outcome of an exchange's events to the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct OutcomeTo {
@@ -89,12 +89,12 @@ pub struct OutcomeTo {
     pub to: Option<SysVar>,
     /// The code with which the device refused the newest event, or 0.
     pub code_to: Option<SysVar>,
-    /// The number of events that have ended, wrapping.
+    /// Number of events that have ended, wrapping.
     pub count_to: Option<SysVar>,
 }
 
 impl OutcomeTo {
-    /// Nothing is told.
+    /// No variable.
     pub const NONE: Self = Self { to: None, code_to: None, count_to: None };
 
     /// The variables that are written.
@@ -107,20 +107,20 @@ impl OutcomeTo {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Transaction {
-    /// The gateway is master of a Modbus RTU line. The operation's counts are those of the fields.
+    /// The gateway is a Modbus master. The operation's counts match the fields.
     Rtu {
-        /// What is asked.
+        /// The request.
         operation: Operation,
         /// The fields that are written; empty for a read.
         written: Span,
         /// The fields that the reply carries; empty for a write.
         read: Span,
     },
-    /// The gateway is the slave, and these are registers or coils that a master may read or write.
+    /// The gateway is a Modbus slave, and a master may read or write these registers or coils.
     Served {
-        /// What a master may ask: all of it, or a part.
+        /// The operation of a master on the whole block; it may also access a part.
         operation: Operation,
-        /// The fields that a master writes; empty where it reads.
+        /// The fields that a master writes; empty if it reads.
         written: Span,
         /// The fields that a master reads.
         read: Span,
@@ -128,11 +128,11 @@ pub enum Transaction {
     /// Frames of the device's own, as indices into
     /// [`GatewayConfig::frames`](super::GatewayConfig::frames).
     Frames {
-        /// What is sent; without one the reply may come at any time.
+        /// The request; without one the reply may arrive at any time.
         request: Option<u8>,
-        /// What answers it; without one, sending it is all.
+        /// The reply; without one the exchange ends with sending.
         reply: Option<u8>,
-        /// What the device sends if it refuses the request.
+        /// The device's frame that refuses the request.
         refusal: Option<u8>,
     },
 }
@@ -143,7 +143,7 @@ pub enum Transaction {
 pub struct FrameSpec {
     /// Its id on a CAN bus; `None` on a line.
     pub id: Option<CanId>,
-    /// It is a remote request on a CAN bus, which has no data.
+    /// A remote request on a CAN bus, which has no data.
     pub remote: bool,
     /// Bytes before the fields.
     pub head: Delimiter,
@@ -153,45 +153,45 @@ pub struct FrameSpec {
     pub fields: Span,
 }
 
-/// When an exchange is asked; several may be set.
+/// Triggers of an exchange; several may be set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Triggers {
-    /// With this period.
+    /// Periodically.
     pub every: Option<Duration>,
     /// Once at the start of the gateway, and again when the peer has started.
     pub start: bool,
-    /// When a value of the request has changed; looked at each cycle of the port.
+    /// When a value of the request changes; checked in each cycle of the port.
     pub change: bool,
-    /// When this bit goes from 0 to 1; looked at each time that it is read. The rise is an event: it is sent once and in
-    /// time, or not at all.
+    /// When this bit changes from 0 to 1; checked each time it is read. This is an event: it is sent once and in time,
+    /// or not at all.
     pub rising: Option<(SysVar, u8)>,
 }
 
 impl Triggers {
-    /// Never by itself: as for a frame that comes unasked.
+    /// No trigger, as for an unsolicited frame.
     pub const NEVER: Self = Self { every: None, start: false, change: false, rising: None };
 
-    /// With this period.
+    /// Periodically.
     pub const fn every(period: Duration) -> Self {
         Self { every: Some(period), ..Self::NEVER }
     }
 
-    /// Whether it is ever asked.
+    /// Whether there is no trigger.
     pub fn is_never(&self) -> bool {
         *self == Self::NEVER
     }
 }
 
-/// How long a reply may take by default.
+/// Default timeout of a reply.
 pub const DEFAULT_REPLY_TIMEOUT: Duration = Duration::from_millis(100);
-/// How long a reply may be late by default, if three timeouts are shorter.
+/// Minimum of the default time for late replies, which is three timeouts.
 pub const DEFAULT_LATE: Duration = Duration::from_secs(1);
-/// The longest time in which an event may be sent.
+/// Maximum of the default time in which an event may be sent.
 pub const MAX_TRIGGER: Duration = Duration::from_secs(1);
 
 impl Exchange {
-    /// An exchange with the defaults of a file: a timeout of 100 ms, one repetition but none of an event, no pause.
+    /// An exchange with the defaults of files: a timeout of 100 ms, one repetition, none of an event, no pause.
     pub const fn new(peer: u8, transaction: Transaction, when: Triggers) -> Self {
         Self {
             peer,
@@ -212,13 +212,13 @@ impl Exchange {
         }
     }
 
-    /// The same exchange with the repetitions that a file has for it: without any, one of a state and none of an event.
+    /// Sets the repetitions as in a file; by default one for states and none for events.
     pub fn repeated(self, retries: Option<u8>) -> Self {
         let of_event = if self.is_event() || self.is_start_event() { retries } else { None };
         Self { retries: retries.unwrap_or(1), event_retries: of_event.unwrap_or(0), ..self }
     }
 
-    /// How long after its request a reply may come.
+    /// How long after its request a late reply may arrive.
     pub fn late(&self) -> Duration {
         self.late.unwrap_or(self.timeout.saturating_mul(3).max(DEFAULT_LATE))
     }
@@ -228,8 +228,8 @@ impl Exchange {
         self.trigger.unwrap_or(port_timeout.min(MAX_TRIGGER))
     }
 
-    /// Whether its start is an event: it is asked at the start and for no other reason, and may do something there. What
-    /// is only read is read again until it is answered.
+    /// Whether its start is an event: it is sent only at the start and may have an effect there. A read is repeated
+    /// until it is answered.
     pub const fn is_start_event(&self) -> bool {
         let Triggers { every, start, change, rising } = self.when;
         let reads =
@@ -237,17 +237,17 @@ impl Exchange {
         start && every.is_none() && !change && rising.is_none() && !reads
     }
 
-    /// Whether an event asks it: a rise that does not stop the peer, or the answer to another one.
+    /// Whether an event triggers it: a rising bit, unless it stops the peer, or the reply to another exchange.
     pub const fn is_event(&self) -> bool {
         (self.when.rising.is_some() || self.follow.is_some()) && !self.stop
     }
 
-    /// Whether nothing ever asks it: its frame comes unasked, or a master asks.
+    /// Whether nothing triggers it: its frame is unsolicited, or a master asks.
     pub fn is_never(&self) -> bool {
         self.when.is_never() && self.follow.is_none()
     }
 
-    /// Whether it is asked and has a reply.
+    /// Whether it has a request and a reply.
     pub const fn is_answered(&self) -> bool {
         match self.transaction {
             Transaction::Rtu { .. } => self.peer != crate::modbus::rtu::BROADCAST,
@@ -256,13 +256,13 @@ impl Exchange {
         }
     }
 
-    /// Whether a master asks, and the gateway answers.
+    /// Whether the gateway serves it as a slave.
     pub(crate) const fn is_served(&self) -> bool {
         matches!(self.transaction, Transaction::Served { .. })
     }
 
-    /// Its frames of a device's own that come from the device (input): a reply, a pending answer, a refusal; or that go
-    /// to it (output).
+    /// The device's own frames of the exchange that are received (input: a reply, a pending answer, a refusal) or sent
+    /// (output).
     pub(crate) fn frames(&self, part: Direction) -> impl Iterator<Item = u8> + use<'_> {
         (0..3).filter_map(move |nth| self.frame(part, nth))
     }
@@ -278,7 +278,7 @@ impl Exchange {
         }
     }
 
-    /// The fields that come from the device (input) with a reply, or go to it (output); `None` if it has no such frame.
+    /// The fields that are received with a reply (input) or sent (output); `None` if there is no such frame.
     pub(crate) fn fields(&self, frames: &[FrameSpec], part: Direction) -> Option<Span> {
         let span = match (self.transaction, part) {
             (Transaction::Rtu { read, .. }, Direction::Input) => read,
@@ -293,8 +293,8 @@ impl Exchange {
         (span.len > 0).then_some(span)
     }
 
-    /// The fields of its pending answer and of its refusal, where they have values: these are input frames like a reply.
-    /// The others only tell what they are.
+    /// The fields of its pending answer and of its refusal, if they have values: these are input frames like a reply.
+    /// Those without values are only recognised.
     pub(crate) fn other_answers(&self, frames: &[FrameSpec], pool: &[FieldSpec]) -> [Option<Span>; 2] {
         let span = |nth| {
             let span = frames.get(usize::from(self.frame(Direction::Input, nth)?))?.fields;
@@ -304,7 +304,6 @@ impl Exchange {
     }
 }
 
-/// Whether a frame from a device has values.
 pub(crate) fn has_values(fields: &[FieldSpec]) -> bool {
     fields.iter().any(FieldSpec::has_value)
 }

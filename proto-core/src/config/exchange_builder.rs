@@ -1,7 +1,7 @@
-//! Exchanges as a program writes them.
+//! Exchanges as written in a program.
 //!
-//! In: addresses, numbers and slices of the caller. Out: the same, borrowed and small; every default
-//! is that of the file (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
+//! In: the caller's addresses, numbers and slices. Out: the same, borrowed and small. All defaults are those of files
+//! (docs/configuration.md). [`Recipe::user`](super::Recipe::user) takes them with
 //! [`RecipeBuilder::exchanges`](super::RecipeBuilder::exchanges).
 
 use super::FieldSpec;
@@ -15,9 +15,9 @@ use crate::wire::scalar::ScalarType;
 
 /// An exchange of a recipe, or a block of a slave, under construction.
 ///
-/// The numbers of registers and coils follow from the fields. In registers the fields are big-endian,
-/// unless their encoding has another order than the usual little-endian one. The fields of coils have
-/// the type [`Coil`], and padding skips so many coils.
+/// The numbers of registers and coils result from the fields. Fields of registers are big-endian unless their encoding
+/// has an order other than the default, little-endian. Fields of coils have the type [`Coil`]; padding skips this many
+/// coils.
 ///
 /// ```
 /// use proto_core::config::{ExchangeBuilder, Coil, GatewayConfig, InputField, OutputField, Port, Recipe};
@@ -52,7 +52,7 @@ use crate::wire::scalar::ScalarType;
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExchangeBuilder<'a> {
-    /// As in the configuration, still without what the fields below decide.
+    /// The exchange in the configuration's form, without the results of the fields below.
     pub(super) exchange: Exchange,
     pub(super) transaction: TransactionDraft<'a>,
     pub(super) retries: Option<u8>,
@@ -61,7 +61,7 @@ pub struct ExchangeBuilder<'a> {
     pub(super) pending: Option<ExchangeFrame<'a>>,
 }
 
-/// Operations have counts of 0 here.
+/// The frames of an exchange; operations have counts of 0 here.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum TransactionDraft<'a> {
     Rtu {
@@ -74,7 +74,7 @@ pub(super) enum TransactionDraft<'a> {
         address: u16,
         fields: Fields<'a>,
     },
-    /// As in the configuration, with counts.
+    /// In the configuration's form, with counts.
     Packed {
         operation: Operation,
         is_served: bool,
@@ -143,32 +143,32 @@ impl<'a> ExchangeBuilder<'a> {
         Self::read(slave, Operation::ReadInputRegisters { address, count: 0 }, fields)
     }
 
-    /// FC 5: writes one coil; slave 0 is all of them.
+    /// FC 5: writes one coil; slave 0 is a broadcast.
     pub fn write_coil(slave: u8, address: u16, coil: &'a [OutputField<'a>; 1]) -> Self {
         Self::write(slave, Operation::WriteCoil { address }, coil)
     }
 
-    /// FC 6: writes one register; slave 0 is all of them.
+    /// FC 6: writes one register; slave 0 is a broadcast.
     pub fn write_register(slave: u8, address: u16, fields: &'a [OutputField<'a>]) -> Self {
         Self::write(slave, Operation::WriteRegister { address }, fields)
     }
 
-    /// FC 15: writes coils; slave 0 is all of them. Skipped coils are written as 0.
+    /// FC 15: writes coils; slave 0 is a broadcast. Skipped coils are written as 0.
     pub fn write_coils(slave: u8, address: u16, coils: &'a [OutputField<'a>]) -> Self {
         Self::write(slave, Operation::WriteCoils { address, count: 0 }, coils)
     }
 
-    /// FC 16: writes holding registers; slave 0 is all of them.
+    /// FC 16: writes holding registers; slave 0 is a broadcast.
     pub fn write_registers(slave: u8, address: u16, fields: &'a [OutputField<'a>]) -> Self {
         Self::write(slave, Operation::WriteRegisters { address, count: 0 }, fields)
     }
 
-    /// FC 22: writes bits of one holding register; slave 0 is all of them. The slave keeps the bits of no field.
+    /// FC 22: writes bits of one holding register; slave 0 is a broadcast. Bits without a field stay unchanged.
     pub fn mask_write_register(slave: u8, address: u16, bits: &'a [OutputField<'a>]) -> Self {
         Self::write(slave, Operation::MaskWriteRegister { address, mask: 0 }, bits)
     }
 
-    /// FC 23: writes holding registers, then reads some.
+    /// FC 23: writes holding registers, then reads holding registers.
     pub fn read_write_registers(
         slave: u8,
         (read_address, read): (u16, &'a [InputField<'a>]),
@@ -183,14 +183,14 @@ impl<'a> ExchangeBuilder<'a> {
         )
     }
 
-    /// A block of the gateway as a slave with this address, 1..=247: input fields are written by the
-    /// master, output fields are read by it.
+    /// A block that the gateway serves as a slave with this address, 1..=247: the master writes input fields and reads
+    /// output fields.
     pub fn served(own: u8, table: Table, address: u16, fields: impl Into<Fields<'a>>) -> Self {
         Self::new(own, TransactionDraft::Served { table, address, fields: fields.into() })
     }
 
-    /// Registers or coils as the configuration has them: with the counts of `operation`, and coils packed into bytes. Of
-    /// the gateway as a slave if `is_served`.
+    /// Registers or coils in the configuration's form, with the counts of `operation`, and coils packed into bytes. If
+    /// `is_served`, they are a block of the gateway as a slave.
     pub const fn packed(
         peer: u8,
         operation: Operation,
@@ -200,17 +200,17 @@ impl<'a> ExchangeBuilder<'a> {
         Self::new(peer, TransactionDraft::Packed { operation, is_served, written, read })
     }
 
-    /// A request of a device's own; of device 0, unless [`Self::peer`] says otherwise.
+    /// A request with a device's own frame, to device 0 unless set by [`Self::peer`].
     pub fn request(request: ExchangeFrame<'a>) -> Self {
         Self::frames(Some(request), None, None, None)
     }
 
-    /// A frame that may come at any time.
+    /// An unsolicited frame, which may arrive at any time.
     pub fn unasked(frame: ExchangeFrame<'a>) -> Self {
         Self::frames(None, Some(frame), None, None)
     }
 
-    /// Frames of a device's own: a request, its reply, a pending answer and a refusal.
+    /// A device's own frames: a request, its reply, a pending answer and a refusal.
     pub fn frames(
         request: Option<ExchangeFrame<'a>>,
         reply: Option<ExchangeFrame<'a>>,
@@ -234,14 +234,14 @@ impl<'a> ExchangeBuilder<'a> {
         Self { exchange, transaction, retries: None, rising: None, outcome: [None; 3], pending: None }
     }
 
-    /// Takes everything but the frames from an exchange, and the repetitions as [`Self::retries`] does.
+    /// Takes everything except the frames from an exchange, and sets the repetitions like [`Self::retries`].
     pub fn settings(self, exchange: Exchange, retries: Option<u8>) -> Self {
         let OutcomeTo { to, code_to, count_to } = exchange.outcome;
         let outcome = [to, code_to, count_to].map(|var| var.map(Var::Var));
         Self { exchange, retries, outcome, rising: None, ..self }
     }
 
-    /// What answers the request. No effect on Modbus, whose replies are known.
+    /// Sets the reply. No effect on Modbus, which defines it.
     pub fn reply(mut self, frame: ExchangeFrame<'a>) -> Self {
         if let TransactionDraft::Frames([_, reply, _]) = &mut self.transaction {
             *reply = Some(frame);
@@ -249,7 +249,8 @@ impl<'a> ExchangeBuilder<'a> {
         self
     }
 
-    /// What the device sends while it is at it: its answer is awaited anew. No effect on Modbus.
+    /// Sets the frame that a device sends while the request is in progress; it restarts the timeout. No effect on
+    /// Modbus.
     pub fn pending(mut self, frame: ExchangeFrame<'a>) -> Self {
         if matches!(self.transaction, TransactionDraft::Frames(_)) {
             self.pending = Some(frame);
@@ -257,7 +258,7 @@ impl<'a> ExchangeBuilder<'a> {
         self
     }
 
-    /// What the device sends if it refuses the request. No effect on Modbus.
+    /// Sets the frame that refuses the request. No effect on Modbus.
     pub fn refusal(mut self, frame: ExchangeFrame<'a>) -> Self {
         if let TransactionDraft::Frames([_, _, refusal]) = &mut self.transaction {
             *refusal = Some(frame);
@@ -265,108 +266,109 @@ impl<'a> ExchangeBuilder<'a> {
         self
     }
 
-    /// The device has restarted when this field of the reply, counted from 0 without padding and texts, becomes `value`:
-    /// what is asked at its start is asked again.
+    /// Sets the sign of a restart: this field of the reply, counted from 0 without padding and texts, becomes `value`.
+    /// Requests at the start are then sent again.
     pub const fn restarted(mut self, field: u8, value: f64) -> Self {
         self.exchange.restarted = Some(Restarted { field, value });
         self
     }
 
-    /// The device of an exchange with frames of its own; exchanges of one device share its presence.
+    /// Sets the device, for exchanges with its own frames; exchanges of one device share its availability.
     pub const fn peer(mut self, peer: u8) -> Self {
         self.exchange.peer = peer;
         self
     }
 
-    /// Asked with this period, up to an hour.
+    /// Sends the request with this period, up to an hour.
     pub const fn every(mut self, period: Duration) -> Self {
         self.exchange.when.every = Some(period);
         self
     }
 
-    /// Asked at the start, and again when the device has started anew.
+    /// Sends the request at the start, and again when the device has restarted.
     pub const fn at_start(mut self) -> Self {
         self.exchange.when.start = true;
         self
     }
 
-    /// Asked when a value of the request has changed.
+    /// Sends the request when one of its values has changed.
     pub const fn on_change(mut self) -> Self {
         self.exchange.when.change = true;
         self
     }
 
-    /// Asked when this bit, 0..=7, of a bit variable goes from 0 to 1.
+    /// Sends the request when this bit, 0..=7, of a bit variable changes from 0 to 1.
     pub fn on_rising(mut self, var: impl Into<Var<'a>>, bit: u8) -> Self {
         self.rising = Some((var.into(), bit));
         self
     }
 
-    /// How long the reply may take, from the end of the request to its own end; 100 ms by default.
+    /// Sets the maximum time from the end of the request to the end of the reply; 100 ms by default.
     pub const fn timeout(mut self, timeout: Duration) -> Self {
         self.exchange.timeout = timeout;
         self
     }
 
-    /// How often a request without a good reply is repeated at once. By default once; an event, or what is only asked
-    /// at the start, is not: the device may carry it out twice.
+    /// Sets how often a request without a good reply is repeated immediately. The default is once, and not at all for
+    /// events and requests sent only at the start, which the device may execute twice.
     pub const fn retries(mut self, retries: u8) -> Self {
         self.retries = Some(retries);
         self
     }
 
-    /// How long after an event it may be sent, up to 10 s; by default the timeout of the port, at most 1 s.
+    /// Sets how long after an event it may be sent, up to 10 s; by default the timeout of the port, at most 1 s.
     pub const fn trigger(mut self, trigger: Duration) -> Self {
         self.exchange.trigger = Some(trigger);
         self
     }
 
-    /// How long after its request a reply may come; by default three timeouts, at least 1 s. Until then nothing is asked
-    /// of the device whose reply could be taken for it.
+    /// Sets how long after its request a late reply may arrive; by default three timeouts, at least 1 s. Until then,
+    /// requests to the device with replies that could be confused with it wait.
     pub const fn late(mut self, late: Duration) -> Self {
         self.exchange.late = Some(late);
         self
     }
 
-    /// It stops its device: it goes first, cancels the device's events, and is repeated until it is confirmed.
+    /// Makes the exchange stop its device: it is sent first, cancels the device's events, and is repeated until
+    /// confirmed.
     pub const fn stops(mut self) -> Self {
         self.exchange.stop = true;
         self
     }
 
-    /// Sent after the good answer of this exchange of the recipe, counted from 0.
+    /// Sends the request after the good reply of this exchange of the recipe, counted from 0.
     pub const fn follows(mut self, exchange: u8) -> Self {
         self.exchange.follow = Some(exchange);
         self
     }
 
-    /// When the values of the reply are overdue; [`Port::NEVER`](super::Port::NEVER) for a reply that comes only when
-    /// something happens. By default the timeout of the port.
+    /// Sets when the values of the reply are overdue; by default the timeout of the port.
+    /// [`Port::NEVER`](super::Port::NEVER) for a reply that is sent only on events.
     pub const fn overdue(mut self, overdue: Duration) -> Self {
         self.exchange.overdue = Some(overdue);
         self
     }
 
-    /// The variable that tells the robot what became of an event, as the number of an
+    /// Sets the variable that reports the outcome of an event to the robot, as the number of an
     /// [`Outcome`](crate::engine::Outcome).
     pub fn outcome(mut self, to: impl Into<Var<'a>>) -> Self {
         self.outcome[0] = Some(to.into());
         self
     }
 
-    /// The variable that gets the code with which the device refused the newest event, or 0.
+    /// Sets the variable for the code with which the device refused the newest event, or 0.
     pub fn outcome_code(mut self, to: impl Into<Var<'a>>) -> Self {
         self.outcome[1] = Some(to.into());
         self
     }
 
-    /// The variable that counts the events that have ended, wrapping.
+    /// Sets the variable that counts the events that have ended, wrapping.
     pub fn outcome_count(mut self, to: impl Into<Var<'a>>) -> Self {
         self.outcome[2] = Some(to.into());
         self
     }
 
-    /// How long the line rests after it, up to 10 s; not at all by default.
+    /// Sets the pause on the line after the exchange, up to 10 s; none by default.
     pub const fn pause(mut self, pause: Duration) -> Self {
         self.exchange.pause = pause;
         self
@@ -377,7 +379,7 @@ impl<'a> ExchangeBuilder<'a> {
         self.all_frames().any(|frame| frame.id.is_some())
     }
 
-    /// The frames of a device's own.
+    /// The device's own frames.
     pub(super) fn all_frames(&self) -> impl Iterator<Item = &ExchangeFrame<'a>> {
         let frames = match &self.transaction {
             TransactionDraft::Frames(frames) => &frames[..],

@@ -1,8 +1,7 @@
-//! The fields of a recipe's part, as a program writes them.
+//! The fields of a recipe's part as written in a program.
 //!
-//! In: names such as `"ForceEnd[1..6]"`, variables, or user-defined fields with their bindings.
-//! Out: the same, borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) reads
-//! the names.
+//! In: names such as `"ForceEnd[1..6]"`, variables, or user-defined fields with their bindings. Out: the same,
+//! borrowed; [`GatewayConfig::add_recipe`](super::GatewayConfig::add_recipe) parses the names.
 
 use super::error::ConfigErrorKind as Kind;
 use super::{
@@ -59,12 +58,12 @@ pub enum Fields<'a> {
     Inputs(&'a [InputField<'a>]),
     /// Fields of the output part of a user-defined recipe.
     Outputs(&'a [OutputField<'a>]),
-    /// As in the configuration; command tables are ranges of its `commands`.
+    /// Fields in the configuration's form; command tables are ranges of its `commands`.
     Specs(&'a [FieldSpec]),
 }
 
 impl Fields<'_> {
-    /// Number of fields and of commands; a name that cannot be read counts as one field.
+    /// Number of fields and of commands; an invalid name counts as one field.
     pub(super) fn counts(&self) -> (usize, usize) {
         match self {
             Self::Names(names) => {
@@ -110,7 +109,7 @@ fields_from! {
 /// A checksum, by its name in files or with its parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Sum<'a> {
-    /// Such as `crc16-modbus`, as its standard has it.
+    /// A name such as `crc16-modbus`, with the parameters of its standard.
     Name(&'a str),
     /// The checksum.
     Checksum(Checksum),
@@ -128,7 +127,7 @@ impl From<Checksum> for Sum<'_> {
     }
 }
 
-/// What a field is on the wire.
+/// The encoding of a field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum OnWire<'a> {
     Value(Encoding, Overflow),
@@ -146,7 +145,7 @@ impl OnWire<'_> {
         if let Self::Value(encoding, _) = self { Self::Value(encoding, Overflow::Wrap) } else { self }
     }
 
-    /// The field; `with_value` is asked for one with a value.
+    /// The configuration's field; `with_value` makes one with a value.
     pub(super) fn spec(
         self,
         with_value: impl FnOnce(Encoding, Overflow) -> Result<FieldSpec, Kind>,
@@ -164,7 +163,7 @@ impl OnWire<'_> {
     }
 }
 
-/// The type of a value that recipes of the controller can have too.
+/// The type of a value that recipes of the controller can also have.
 fn plain(encoding: Encoding, overflow: Overflow) -> Option<ScalarType> {
     match encoding.kind {
         EncodingKind::Scalar(ty) if encoding == Encoding::scalar(ty) && overflow == Overflow::Usual => {
@@ -175,7 +174,7 @@ fn plain(encoding: Encoding, overflow: Overflow) -> Option<ScalarType> {
 }
 
 impl FieldSpec {
-    /// A field of an input part; a device's only if the controller's recipes can have no such field.
+    /// A field of an input part; a device's field only if the controller's recipes cannot have it.
     pub fn input(encoding: Encoding, overflow: Overflow, to: InputBinding) -> Self {
         match plain(encoding, overflow) {
             Some(ty) => Self::UserInput { ty, to },
@@ -183,7 +182,7 @@ impl FieldSpec {
         }
     }
 
-    /// A field of an output part; a device's only if the controller's recipes can have no such field.
+    /// A field of an output part; a device's field only if the controller's recipes cannot have it.
     pub fn output(encoding: Encoding, overflow: Overflow, from: OutputBinding) -> Self {
         match plain(encoding, overflow) {
             Some(ty) => Self::UserOutput { ty, from },
@@ -194,9 +193,9 @@ impl FieldSpec {
 
 /// A field of a user-defined recipe's input part.
 ///
-/// A type such as `ScalarType::Word` is a value as the controller's own recipes have it. An
-/// [`Encoding`] is what only devices have: big-endian numbers, bits, digits. A recipe with one of
-/// these, a constant, padding or a checksum is a device's, and is for field ports.
+/// A type such as `ScalarType::Word` is a value as in the controller's own recipes. An [`Encoding`] is for values that
+/// only devices have: big-endian numbers, bits, digits. A recipe with such a field, a constant, padding or a checksum
+/// is a device's recipe, which is for field ports.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InputField<'a> {
     pub(super) on_wire: OnWire<'a>,
@@ -220,7 +219,7 @@ pub(super) enum Entries<'a> {
 }
 
 impl<'a> Entries<'a> {
-    /// First and last value, and the text.
+    /// First value, last value and text of each entry.
     pub(super) fn iter(self) -> impl Iterator<Item = (i64, i64, &'a str)> {
         let (values, ranges) = match self {
             Self::Values(values) => (values, &[][..]),
@@ -243,40 +242,40 @@ impl<'a> InputField<'a> {
         Self { on_wire: OnWire::value(encoding), does }
     }
 
-    /// A field that switches one bit of an input variable, such as `BitInputReg[3].4`: off for 0, on
-    /// for any other value. Integer types only.
+    /// A field for one bit of an input variable, such as `BitInputReg[3].4`: off for 0, on for any other value. Integer
+    /// types only.
     pub fn bit(encoding: impl Into<Encoding>, name: &'a str) -> Self {
         Self { on_wire: OnWire::value(encoding), does: Does::WritesBit { name } }
     }
 
-    /// A field whose value picks a command of port 2000 when it changes: pairs of value and command,
-    /// such as `(1, "run(pick.jspf,50)")`. Integer types only.
+    /// A field whose value selects a command of port 2000 when it changes: pairs of value and command, such as `(1,
+    /// "run(pick.jspf,50)")`. Integer types only.
     pub fn commands(encoding: impl Into<Encoding>, entries: &'a [(i64, &'a str)]) -> Self {
         let does =
             Does::Commands { entries: Entries::Values(entries), when: CommandWhen::Change, idle: None };
         Self { on_wire: OnWire::value(encoding), does }
     }
 
-    /// As [`Self::commands`], with ranges of values: first value, last value and command, such as
-    /// `(1, 100, "speed({value})")`. `{value}` stands for the field's value.
+    /// Like [`Self::commands`], with ranges of values: first value, last value and command, such as `(1, 100,
+    /// "speed({value})")`. `{value}` is replaced by the field's value.
     pub fn command_ranges(encoding: impl Into<Encoding>, entries: &'a [(i64, i64, &'a str)]) -> Self {
         let does =
             Does::Commands { entries: Entries::Ranges(entries), when: CommandWhen::Change, idle: None };
         Self { on_wire: OnWire::value(encoding), does }
     }
 
-    /// An alive counter, which goes from `max` to 0: a frame with the number of the one before is not
-    /// taken, so that a frozen device falls silent.
+    /// An alive counter, which wraps from `max` to 0. A frame with the same number as the previous one is not applied,
+    /// so a frozen device becomes overdue.
     pub fn counter(encoding: impl Into<Encoding>, max: u32) -> Self {
         Self { on_wire: OnWire::value(encoding), does: Does::Counter { max } }
     }
 
-    /// An integer that a frame must have here; one with another is not this frame.
+    /// A constant integer; a frame with another value is not this frame.
     pub fn constant(encoding: impl Into<Encoding>, value: i64) -> Self {
         Self { on_wire: OnWire::Fixed(encoding.into(), value), does: Does::Nothing }
     }
 
-    /// Bytes without a meaning.
+    /// Bytes without meaning.
     pub const fn padding(len: u8) -> Self {
         Self { on_wire: OnWire::Padding { len, fill: 0 }, does: Does::Nothing }
     }
@@ -286,8 +285,7 @@ impl<'a> InputField<'a> {
         Self { on_wire: OnWire::Checksum(sum.into()), does: Does::Nothing }
     }
 
-    /// Makes what the variable cannot hold wrap around; otherwise such a frame is rejected. Integers
-    /// only.
+    /// Makes numbers out of the variable's range wrap around, instead of rejecting the frame. Integers only.
     pub fn wrapping(self) -> Self {
         Self { on_wire: self.on_wire.wrapping(), ..self }
     }
@@ -308,8 +306,8 @@ impl<'a> InputField<'a> {
         self
     }
 
-    /// Sets the value at which the device asks for nothing, if it is not 0: every other value that
-    /// picks no command is counted as unknown. No effect on other fields.
+    /// Sets the idle value, 0 by default, at which the device requests nothing: any other value that selects no command
+    /// is counted as unknown. No effect on other fields.
     pub fn idle(mut self, value: i64) -> Self {
         if let Does::Commands { idle, .. } = &mut self.does {
             *idle = Some(value);
@@ -327,7 +325,7 @@ impl<'a> InputField<'a> {
     }
 }
 
-/// A field of a user-defined recipe's output part; see [`InputField`] about types and encodings.
+/// A field of a user-defined recipe's output part; [`InputField`] explains types and encodings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutputField<'a> {
     pub(super) on_wire: OnWire<'a>,
@@ -344,7 +342,7 @@ pub(super) enum Allowed<'a> {
 }
 
 impl<'a> Allowed<'a> {
-    /// What stands behind the field.
+    /// The entries that follow the field in the configuration.
     pub(super) fn specs(self) -> impl Iterator<Item = FieldSpec> + use<'a> {
         let (limits, entries) = match self {
             Self::All => (None, &[][..]),
@@ -400,7 +398,7 @@ impl<'a> OutputField<'a> {
         Self::new(encoding, Sends::Reply)
     }
 
-    /// So many bytes of this value.
+    /// This many bytes with this value.
     pub const fn padding(len: u8, fill: u8) -> Self {
         Self { on_wire: OnWire::Padding { len, fill }, sends: Sends::Constant(0.0), allowed: Allowed::All }
     }
@@ -414,26 +412,24 @@ impl<'a> OutputField<'a> {
         Self { on_wire: OnWire::value(encoding), sends, allowed: Allowed::All }
     }
 
-    /// Makes what the field cannot hold wrap around, instead of becoming the nearest number.
-    /// Integers only.
+    /// Makes numbers out of the field's range wrap around, instead of saturating. Integers only.
     pub fn wrapping(self) -> Self {
         Self { on_wire: self.on_wire.wrapping(), ..self }
     }
 
-    /// Sends only numbers from `low` to `high`, after scale and offset. With another one the frame is not sent.
-    /// The field is a device's.
+    /// Limits the number after scale and offset: the frame is not sent if it is not in `low..=high`. Makes the field a
+    /// device's.
     pub fn limited(self, low: f64, high: f64) -> Self {
         Self { allowed: Allowed::Inside(Limits { low, high, outside: Outside::Refuse }), ..self }
     }
 
-    /// As [`Self::limited`], but instead of another number the nearer limit is sent.
+    /// Like [`Self::limited`], but sends the nearer limit instead.
     pub fn clamped(self, low: f64, high: f64) -> Self {
         Self { allowed: Allowed::Inside(Limits { low, high, outside: Outside::Clamp }), ..self }
     }
 
-    /// Sends the numbers of a table: first value of the source, last value and what is sent for them, such as
-    /// `(1, 4, 0.0)`. With a value in no entry the frame is not sent. The field is a device's, and takes no
-    /// scale and offset.
+    /// Sends numbers of a table: first and last value of the source, and the number sent for them, such as `(1, 4,
+    /// 0.0)`. For other values the frame is not sent. Makes the field a device's; it has no scale and offset.
     pub fn mapped(self, entries: &'a [(i64, i64, f64)]) -> Self {
         Self { allowed: Allowed::Mapped(entries), ..self }
     }
@@ -443,8 +439,7 @@ impl<'a> OutputField<'a> {
         self.allowed.specs().count().saturating_add(1)
     }
 
-    /// A value of the controller's state packet, saturated to the field's type. A program takes it
-    /// from [`StateValue::parse`].
+    /// A value of the controller's state packet, saturated to the field's type; see [`StateValue::parse`].
     pub fn state(encoding: impl Into<Encoding>, value: StateValue) -> Self {
         Self::new(encoding, Sends::State { value, scale: 1.0, offset: 0.0 })
     }
@@ -460,8 +455,8 @@ impl<'a> OutputField<'a> {
         Self::new(encoding, Sends::Link { link, scale: 1.0, offset: 0.0 })
     }
 
-    /// Makes the field `value * scale + offset` of a variable, of a value of the state packet, of a
-    /// port's health or of a link's state; counts refuse it. No effect on other fields.
+    /// Sends `value * scale + offset` for a variable, a value of the state packet, a port's health or a link's state;
+    /// refused for counts. No effect on other fields.
     pub fn scaled(mut self, scale: f32, offset: f32) -> Self {
         if let Sends::Variable { scale: own_scale, offset: own_offset, .. }
         | Sends::State { scale: own_scale, offset: own_offset, .. }
@@ -487,12 +482,12 @@ impl<'a> CanFields<'a> {
         Self { id, fields: fields.into() }
     }
 
-    /// With an id of 11 bits, 0..=0x7FF.
+    /// A frame with an id of 11 bits, 0..=0x7FF.
     pub fn standard(id: u16, fields: impl Into<Fields<'a>>) -> Self {
         Self::new(CanId::Standard(id), fields)
     }
 
-    /// With an id of 29 bits, 0..=0x1FFF_FFFF.
+    /// A frame with an id of 29 bits, 0..=0x1FFF_FFFF.
     pub fn extended(id: u32, fields: impl Into<Fields<'a>>) -> Self {
         Self::new(CanId::Extended(id), fields)
     }

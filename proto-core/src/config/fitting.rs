@@ -1,6 +1,6 @@
-//! Which numbers of an input field its variable takes.
+//! The range of an input field's numbers that fit its variable.
 //!
-//! In: a field and its binding. Out: the numbers that fit. A frame with another one is rejected (D22).
+//! In: a field and its binding. Out: the range. A frame with a number out of it is rejected (D22).
 
 use super::{FieldSpec, InputBinding};
 use crate::device::{Encoding, Overflow};
@@ -14,9 +14,9 @@ use crate::wire::scalar::{Scalar, ScalarType};
 pub struct Fitting {
     /// The variable.
     pub var: SysVar,
-    /// The smallest number that surely fits, in the field's unit: before scale and offset.
+    /// The smallest number that certainly fits, in the field's unit: before scale and offset.
     pub low: f64,
-    /// The largest number that surely fits.
+    /// The largest number that certainly fits.
     pub high: f64,
 }
 
@@ -43,22 +43,22 @@ impl FieldSpec {
         }
     }
 
-    /// The numbers of an input field that fit its variable; `None` if all do that the field can have,
-    /// or if it writes none. Of a float variable only huge numbers would not fit: `None`. What stands behind the field is
-    /// not looked at.
+    /// The numbers of an input field that fit its variable. `None` if all numbers of the field fit, if it writes no
+    /// variable, or if the variable is a float, which only huge numbers do not fit. Ignores entries that follow the
+    /// field.
     pub fn fitting(&self) -> Option<Fitting> {
         let WrittenVariable { encoding, var, scale, offset } = self.written()?;
         let (low, high) = fitting_numbers(&encoding, (var, var.ty()), scale, offset)?;
         Some(Fitting { var, low, high })
     }
 
-    /// Whether an input field's variable takes the number. True for a field that writes none.
+    /// Whether a number fits the input field's variable; true for a field that writes none.
     pub fn takes(&self, value: Scalar) -> bool {
         self.written().is_none_or(|to| bind_to_variable(to.var, value, to.scale, to.offset).is_some())
     }
 
-    /// The variable that takes no negative number of an input field that can have them: there is no
-    /// offset, and no negative scale. `None` of another field.
+    /// The variable, if the input field can have negative numbers but the variable cannot take them, without an offset
+    /// or a negative scale; otherwise `None`.
     pub fn rejects_negative(&self) -> Option<SysVar> {
         let WrittenVariable { encoding, var, scale, offset } = self.written()?;
         let is_signed = encoding.range().0 < 0.0;
@@ -67,7 +67,7 @@ impl FieldSpec {
     }
 }
 
-/// The numbers that a field can have and that fit its variable, which holds numbers of this type; `None` if all do.
+/// The numbers of a field that fit its variable, whose numbers have this type; `None` if all fit.
 pub(crate) fn fitting_numbers(
     encoding: &Encoding,
     (var, ty): (SysVar, ScalarType),
@@ -84,12 +84,12 @@ pub(crate) fn fitting_numbers(
         (_, range) => range,
     };
     let between = |one: f64, other: f64| (one.min(other), one.max(other));
-    // Of the variable, rounded as the engine rounds.
+    // Rounded to the variable's numbers like in the engine.
     let (first, last) = between((least - 0.5 - offset) / scale, (most + 0.5 - offset) / scale);
     if first < low && last > high {
         return None;
     }
-    // Next to the end, where rounding decides, the number that surely fits.
+    // At the ends, where rounding decides, uses a number that certainly fits.
     let (first, last) = between((least - offset) / scale, (most - offset) / scale);
     let (first, last) = match encoding.reads_integers() {
         true => (ceil(first), -ceil(-last)),
@@ -98,7 +98,7 @@ pub(crate) fn fitting_numbers(
     Some((first.max(low), last.min(high)))
 }
 
-/// The next integer above; `core` has no `ceil`.
+/// Rounds up to an integer; `core` has no `ceil`.
 fn ceil(value: f64) -> f64 {
     let rounded = round(value);
     if rounded < value { rounded + 1.0 } else { rounded }
