@@ -1,4 +1,4 @@
-//! The keys of a configuration that a mistake can be at.
+//! The keys of a configuration at which there can be an error.
 
 /// A key of the controller's section.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -34,7 +34,7 @@ pub enum RecipeKey {
     Whole,
     /// Its name.
     Name,
-    /// What makes a port send it.
+    /// When a port sends it.
     Send,
 }
 
@@ -54,11 +54,11 @@ pub enum ExchangeKey {
     Rising,
     /// How long its reply may take.
     Timeout,
-    /// How long the line rests after it.
+    /// The pause after it.
     Pause,
     /// How long after an event it may be sent.
     Trigger,
-    /// How long after its request a reply may come.
+    /// How long after its request a late reply may arrive.
     Late,
     /// Whether it stops its peer.
     Stop,
@@ -66,7 +66,7 @@ pub enum ExchangeKey {
     Follow,
     /// When the values of its reply are overdue.
     Overdue,
-    /// The variables that tell what became of its events.
+    /// The variables for the outcome of its events.
     Outcome,
     /// The request.
     Request,
@@ -76,7 +76,7 @@ pub enum ExchangeKey {
     Pending,
     /// The refusal.
     Refusal,
-    /// What in the reply tells that its peer has restarted.
+    /// The sign of a restart of its peer in the reply.
     Restarted,
 }
 
@@ -94,7 +94,7 @@ pub enum PortKey {
     Timeout,
     /// Its safe values.
     OnTimeout,
-    /// When its outputs are stale.
+    /// The age at which its outputs are stale.
     StaleAfter,
     /// A serial line's speed.
     Baud,
@@ -104,7 +104,7 @@ pub enum PortKey {
     IdleGap,
     /// A serial line's turnaround.
     Turnaround,
-    /// Whether a serial line gives back what is sent on it.
+    /// Whether a serial line echoes.
     Echo,
     /// A CAN bus's speed.
     Bitrate,
@@ -114,10 +114,10 @@ pub enum PortKey {
     To,
     /// The variables of its health.
     Health,
-    /// Whether it starts with safe values.
+    /// Whether safe values apply from the start.
     SafeAtStart,
-    /// When it sends without a change.
+    /// The time without a change after which it sends.
     Refresh,
-    /// After how long without a word a peer of its exchanges has started anew.
+    /// The time without a frame after which a peer of its exchanges counts as restarted.
     Absent,
 }

@@ -1,9 +1,9 @@
-//! What the number of a field may be, and what becomes of it: limits, a table of numbers, and the rules of input fields.
+//! Limits of a field's number, tables of numbers, and rules of input fields.
 //!
-//! All stand behind their field, as entries of their own, so that fields without them have no room for them. Frames have
-//! nothing in their place. A number of an output field that is not allowed is not sent, and with it the frame: only
-//! [`Outside::Clamp`] sends another one. Input fields have them if they write a variable as a whole. Nothing here has been
-//! checked; `check_limits.rs` does that.
+//! They follow their field as separate entries, so that fields without them take no space for them. They have no bytes
+//! in the frame. If an output field's number is not allowed, the frame is not sent, except that [`Outside::Clamp`]
+//! sends another number. Input fields can have them if they write a variable as a whole. Nothing here is checked;
+//! `check_limits.rs` does that.
 
 use crate::device::Encoding;
 use crate::image::round;
@@ -12,32 +12,32 @@ use crate::sysvar::{SysVar, VarBit};
 /// Maximum number of limits and entries of tables of numbers on all ports together.
 pub const MAX_SENDABLE: usize = 64;
 
-/// The numbers that an output field may send, of those that fit it; or those that an input field takes.
+/// The numbers that an output field may send, or that an input field accepts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Limits {
-    /// The lowest number, as the frame has it: of an output field after scale and offset, of an input field before.
+    /// The lowest number in the frame: for an output field after scale and offset, for an input field before them.
     pub low: f64,
     /// The highest number.
     pub high: f64,
-    /// What becomes of another one.
+    /// What happens to a number out of the limits.
     pub outside: Outside,
 }
 
-/// What becomes of a number outside of its field's limits.
+/// What happens to a number out of the limits of its field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Outside {
-    /// It is not sent, nor is its frame. An input field with it is rejected.
+    /// The frame is not sent, or the input field is rejected.
     #[default]
     Refuse,
-    /// The nearer limit is sent, or taken.
+    /// The nearer limit is used.
     Clamp,
 }
 
-/// One entry of the table of an output field: these values of its source send this number. A value in no
-/// entry is not sent, nor is its frame. Of an input field: for these values its variable becomes this number.
+/// One entry of a field's table. For an output field: for these values of the source it sends this number; for a value
+/// in no entry the frame is not sent. For an input field: for these values the variable gets this number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapEntry {
@@ -45,24 +45,23 @@ pub struct MapEntry {
     pub first: i64,
     /// The last value.
     pub last: i64,
-    /// The number that is sent, or that the variable becomes.
+    /// The number to send, or the number for the variable.
     pub sent: f64,
 }
 
 impl Limits {
-    /// The number that is sent for `number`; not a number if none is.
+    /// The number to send for `number`; NaN if it is not allowed.
     pub(crate) fn apply(&self, encoding: &Encoding, number: f64) -> f64 {
         self.apply_to(encoding.is_integer(), number)
     }
 
-    /// The number that is taken for `number`; not a number if none is.
+    /// The number to use for `number`; NaN if it is not allowed.
     pub(crate) fn take(&self, encoding: &Encoding, number: f64) -> f64 {
         self.apply_to(encoding.reads_integers(), number)
     }
 
     fn apply_to(&self, is_integer: bool, number: f64) -> f64 {
-        // A scale such as 0.1 is a little more than it is written, so numbers that a float does not tell
-        // from a limit are within it.
+        // A scale such as 0.1 is inexact, so numbers that a float cannot distinguish from a limit are within it.
         let near = |number: f64| if is_integer { round(number) } else { f64::from(number as f32) };
         let is_inside = near(number) >= near(self.low) && near(number) <= near(self.high);
         if number.is_nan() || !is_inside && self.outside == Outside::Refuse {
@@ -73,17 +72,17 @@ impl Limits {
 }
 
 impl MapEntry {
-    /// Whether the entry is for this value, rounded.
+    /// Whether the entry is for this value after rounding.
     pub(crate) fn has(&self, value: f64) -> bool {
         let value = round(value);
         value >= self.first as f64 && value <= self.last as f64
     }
 }
 
-/// Maximum number of characters of a text that says that there is no value.
+/// Maximum number of characters of a text for "no value".
 pub const NO_TEXT: usize = 8;
 
-/// A text that says that there is no value, such as `----`.
+/// A text for "no value", such as `----`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct NoText {
@@ -92,7 +91,7 @@ pub struct NoText {
 }
 
 impl NoText {
-    /// A text of 1..=[`NO_TEXT`] printable ASCII characters, without spaces at its ends; `None` for another one.
+    /// A text of 1..=[`NO_TEXT`] printable ASCII characters, without spaces at its ends; otherwise `None`.
     pub fn new(text: &str) -> Option<Self> {
         let text = text.as_bytes();
         let is_fine = (1..=NO_TEXT).contains(&text.len()) && text.trim_ascii() == text;
@@ -104,29 +103,29 @@ impl NoText {
         Some(Self { len: text.len() as u8, bytes })
     }
 
-    /// Its characters.
+    /// The characters.
     pub fn bytes(&self) -> &[u8] {
         self.bytes.get(..usize::from(self.len)).unwrap_or(&[])
     }
 }
 
-/// What becomes of the value of the input field before it.
+/// A rule for the value of the input field before it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[non_exhaustive]
 pub enum InputRule {
-    /// A word register has it in two's complement: -32768..=32767 after scale and offset.
+    /// A word register holds the value in two's complement: -32768..=32767 after scale and offset.
     Int16,
-    /// The variable becomes this for values that no [`MapEntry`] has; without it the field is rejected.
+    /// The variable gets this number for values in no [`MapEntry`]; without this rule the field is rejected.
     Else(f64),
-    /// This number says that there is no value.
+    /// This number means "no value".
     NoNumber(f64),
-    /// This text says that there is no value, spaces around it aside; fields of digits only.
+    /// This text means "no value", also with spaces around it; only for fields of digits.
     NoText(NoText),
-    /// The digits of a decimal field have a comma where others have a point.
+    /// A decimal field has a comma as decimal point.
     Comma,
-    /// This variable, a word register or one bit, is 1 while the field's newest value was taken, and 0 when it was rejected,
-    /// had none, or is overdue.
+    /// This variable, a word register or one bit, is 1 while the field's newest value is accepted, and 0 if it is
+    /// rejected, missing or overdue.
     ValidTo {
         /// An input variable.
         var: SysVar,
@@ -136,7 +135,7 @@ pub enum InputRule {
 }
 
 impl InputRule {
-    /// The word register that tells whether a value was taken.
+    /// The word register of [`Self::ValidTo`].
     pub(super) const fn variable(self) -> Option<SysVar> {
         match self {
             Self::ValidTo { var, bit: None } => Some(var),
@@ -144,7 +143,7 @@ impl InputRule {
         }
     }
 
-    /// The bit that does.
+    /// The bit of [`Self::ValidTo`].
     pub(super) const fn bit(self) -> Option<VarBit> {
         match self {
             Self::ValidTo { var, bit: Some(bit) } => Some(VarBit { var, bit }),
@@ -174,7 +173,7 @@ mod tests {
             assert!(sent(Outside::Refuse, number).is_nan());
             assert_eq!(sent(Outside::Clamp, number), nearest);
         }
-        // An integer field has the rounded number.
+        // Integer fields send the rounded number.
         assert_eq!(sent(Outside::Refuse, 100.4), 100.0);
         assert!(sent(Outside::Refuse, 100.5).is_nan());
         assert!(sent(Outside::Refuse, f64::NAN).is_nan());

@@ -1,6 +1,6 @@
-//! How long exchanges take on a line, and how much of it they take together.
+//! Line usage of exchanges, alone and together.
 //!
-//! In: a configuration. Out: times. Nothing is refused here.
+//! In: a configuration. Out: times. Refuses nothing.
 
 use super::budget::can_frame_time;
 use super::exchange::{Exchange, FrameSpec, Transaction};
@@ -10,24 +10,22 @@ use crate::sysvar::Direction;
 use crate::time::Duration;
 use crate::wire::can::CanId;
 
-/// How much of a port's line one exchange takes.
+/// Line usage of one exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ExchangeBudget {
-    /// Bytes of the request, with everything around its fields; on CAN of its data. 0 without a
-    /// request.
+    /// Length of the request in bytes, including the bytes around its fields; on CAN, of its data. 0 without a request.
     pub request: usize,
-    /// Maximum number of bytes of the reply, in the same way.
+    /// Maximum length of the reply, counted in the same way.
     pub reply: usize,
-    /// From the end of what was before it to the end of its pause, if the reply comes at once: the
-    /// silences, both frames and the pause.
+    /// Time from the end of the previous exchange to the end of its pause, if the reply comes at once: silences, both
+    /// frames and the pause.
     pub time: Duration,
-    /// The same if no reply comes in time; as [`Self::time`] where none is expected.
+    /// Like [`Self::time`], if no reply comes before the timeout; the same if no reply is expected.
     pub time_without_reply: Duration,
 }
 
 impl ConfigView<'_> {
-    /// How much of the line of `port` an exchange of its recipe takes. Of a slave's block: what a
-    /// master takes that reads or writes all of it.
+    /// Line usage of an exchange on `port`. For a slave's block, that of a master that reads or writes all of it.
     pub fn exchange_budget(self, port: &Port, exchange: &Exchange) -> ExchangeBudget {
         let frame = |nth: Option<u8>| self.frames.get(usize::from(nth?));
         let bytes = |frame: Option<&FrameSpec>| frame.map_or(0, |frame| self.bytes_of(frame));
@@ -44,7 +42,7 @@ impl ConfigView<'_> {
                 (bytes(request), bytes(reply), [id(request), id(reply)])
             }
         };
-        // A header of 6 bytes in place of a CRC.
+        // Modbus TCP has a header of 6 bytes instead of a CRC.
         let framing = if port.bus.is_modbus_tcp() { 4 } else { 0 };
         let (request, reply) = (request.saturating_add(framing), reply.saturating_add(framing));
         let [request_id, reply_id] = ids;
@@ -59,19 +57,19 @@ impl ConfigView<'_> {
         }
     }
 
-    /// How long the reply to an exchange takes on the line of `port`, with the silence before it.
+    /// The time of the reply to an exchange on `port`, including the silence before it.
     pub(super) fn reply_time(self, port: &Port, exchange: &Exchange) -> Duration {
         let budget = self.exchange_budget(port, exchange);
         on_line(port, exchange, budget.reply, None)
     }
 
-    /// The exchanges of a recipe, as bits, that wait while an answer to this one may come: those of its peer for whose
-    /// replies it could be taken.
+    /// The exchanges of a recipe, as bits, that wait while an answer to this one may arrive: those of its peer for
+    /// whose replies it could be mistaken.
     pub fn held_back_by(self, recipe: &Recipe, exchange: &Exchange) -> u64 {
         self.exchanges_that(recipe, |other| self.may_confirm(exchange, other))
     }
 
-    /// The exchanges, as bits, whose answers could be taken for the reply to this one.
+    /// The exchanges, as bits, whose answers could be mistaken for the reply to this one.
     pub(crate) fn waits_for(self, recipe: &Recipe, exchange: &Exchange) -> u64 {
         self.exchanges_that(recipe, |other| self.may_confirm(other, exchange))
     }
@@ -81,7 +79,7 @@ impl ConfigView<'_> {
         all.fold(0, |set, (nth, _)| set | 1_u64.unbounded_shl(nth))
     }
 
-    /// Whether what answers an exchange cannot be told from a reply to the other one by content or length.
+    /// Whether an answer to `own` (reply, pending answer or refusal) could be mistaken for the reply to `other`.
     fn may_confirm(self, own: &Exchange, other: &Exchange) -> bool {
         let frame = |nth: Option<u8>| self.frames.get(usize::from(nth?));
         own.peer == other.peer
@@ -100,8 +98,8 @@ impl ConfigView<'_> {
             }
     }
 
-    /// How much of the line of `port` is taken, in percent, rounded up: by its exchanges with a period
-    /// and, if there is one, by an output part that is sent each cycle. `None` without such exchanges.
+    /// Line usage of `port` in percent, rounded up: of its periodic exchanges and of an output part that is sent each
+    /// cycle. `None` without periodic exchanges.
     pub fn line_share(self, port: &Port) -> Option<u32> {
         let recipe = self.recipes.get(usize::from(port.recipe))?;
         let share = |time: Duration, every: Duration| {
@@ -121,7 +119,7 @@ impl ConfigView<'_> {
         Some(u32::try_from(asked.saturating_add(sent).div_ceil(10_000)).unwrap_or(u32::MAX))
     }
 
-    /// The longest period of an exchange of `port` whose reply has values.
+    /// The longest period of the exchanges of `port` whose replies have values.
     pub(super) fn slowest_reply(self, port: &Port) -> Option<Duration> {
         let recipe = self.recipes.get(usize::from(port.recipe))?;
         let with_reply = self
@@ -141,14 +139,14 @@ impl ConfigView<'_> {
 /// The silence before a frame of an exchange.
 fn silence(port: &Port, exchange: &Exchange) -> Duration {
     match (&port.bus, exchange.transaction) {
-        // A slave answers when the silence behind the request has ended it.
+        // A slave answers after the silence that ends the request.
         (Bus::Rs485(line), Transaction::Served { .. }) => line.turnaround.max(line.idle_gap),
         (Bus::Rs485(line), _) => line.turnaround,
         _ => Duration::ZERO,
     }
 }
 
-/// A frame and the silence before it.
+/// The time of a frame and the silence before it.
 fn on_line(port: &Port, exchange: &Exchange, len: usize, id: Option<CanId>) -> Duration {
     match (&port.bus, id) {
         (Bus::Rs485(line), _) if len > 0 => silence(port, exchange) + line.time_on_line(len),
@@ -157,7 +155,7 @@ fn on_line(port: &Port, exchange: &Exchange, len: usize, id: Option<CanId>) -> D
     }
 }
 
-/// A request, and the time that the slaves have after one to all of them.
+/// The time of a request, including the turnaround after a broadcast.
 fn request_on_line(port: &Port, exchange: &Exchange, len: usize, id: Option<CanId>) -> Duration {
     let is_broadcast = matches!(exchange.transaction, Transaction::Rtu { .. }) && exchange.peer == BROADCAST;
     let rest = if is_broadcast { Timing::TURNAROUND } else { Duration::ZERO };

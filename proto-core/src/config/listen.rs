@@ -1,8 +1,7 @@
 //! The address and port that a port listens on.
 //!
-//! In: text such as `0.0.0.0:50000` or `[::]:50000`. Out: the same result as the parser of
-//! [`SocketAddr`] for every text. That parser is not used because the compiler cannot prove that it
-//! does not panic.
+//! In: text such as `0.0.0.0:50000` or `[::]:50000`. Out: the same result as from the parser of [`SocketAddr`], which
+//! is not used because the compiler cannot prove that it does not panic.
 
 use core::net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
 
@@ -30,7 +29,7 @@ pub fn listen_address(text: &str) -> Option<SocketAddr> {
 }
 
 fn decimal<T: core::str::FromStr>(digits: &str) -> Option<T> {
-    // `parse` would accept a sign.
+    // `parse` also accepts a sign.
     digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())?
 }
 
@@ -39,7 +38,7 @@ fn ipv4(text: &str) -> Option<Ipv4Addr> {
     let (second, rest) = split_once(rest, b'.')?;
     let (third, fourth) = split_once(rest, b'.')?;
     let octet = |text: &str| {
-        // A leading zero means octal to some programs.
+        // Some programs interpret a leading zero as octal.
         let leading_zero = text.len() > 1 && text.starts_with('0');
         if leading_zero { None } else { decimal(text) }
     };
@@ -79,7 +78,7 @@ pub(super) fn ipv6(text: &str) -> Option<Ipv6Addr> {
     }
     let mut all = [0; 8];
     match gap {
-        // It stands for at least one group.
+        // `::` replaces at least one group.
         Some(before) if !groups.is_full() => {
             let (front, back) = groups.split_at_checked(before)?;
             all.iter_mut().zip(front).for_each(|(place, group)| *place = *group);

@@ -1,10 +1,10 @@
-//! The gateway's configuration as the engine takes it. TOML on the host, postcard on the board and
-//! the builder in a program all produce these types (docs/architecture.md section 5).
+//! The gateway's configuration for the engine. TOML on the host, postcard on the board and the builder in a program all
+//! produce these types (docs/architecture.md section 5).
 //!
-//! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here has
-//! been checked until [`ConfigView::validate`] has accepted it. [`GatewayConfig::builder`] makes a
-//! configuration in a program. If the default sizes are too large, give smaller ones, such as
-//! `GatewayConfig<1, 1, 32, 0, 4>`: one port, one recipe, 32 fields, no commands, 4 safe values.
+//! Bounded and plain: names are kept for messages, everything else is numbers. Nothing here is checked before
+//! [`ConfigView::validate`]. [`GatewayConfig::builder`] builds a configuration in a program. Smaller sizes than the
+//! defaults are possible, such as `GatewayConfig<1, 1, 32, 0, 4>`: one port, one recipe, 32 fields, no commands, 4 safe
+//! values.
 
 mod add;
 mod add_exchange;
@@ -112,12 +112,11 @@ pub type Name = String<MAX_NAME>;
 /// Head or tail of a stream part.
 pub type Delimiter = Vec<u8, MAX_DELIMITER>;
 
-/// A whole gateway file. The parameters are the numbers of ports, recipes, fields in all recipes,
-/// entries in all command tables, safe values on all ports, and exchanges in all recipes that there
-/// is room for.
+/// A whole gateway file. The parameters are the maximum numbers of ports, recipes, fields in all recipes, entries in
+/// all command tables, safe values on all ports, and exchanges in all recipes.
 ///
-/// The defaults are the maximum for a file and take 59 KiB. [`Self::empty`] is all zeros, so a
-/// static one takes no flash.
+/// The defaults are the maximum for a file and take 59 KiB. [`Self::empty`] is all zeros, so a static one takes no
+/// flash.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[non_exhaustive]
@@ -141,11 +140,11 @@ pub struct GatewayConfig<
     pub fields: Vec<FieldSpec, ALL_FIELDS>,
     /// The entries of all command tables; bindings refer to ranges of it.
     pub commands: Vec<CommandEntry, COMMANDS>,
-    /// The values that inputs take when their port times out; ports refer to ranges of it.
+    /// The values that inputs take if their port times out; ports refer to ranges of it.
     pub safe_values: Vec<SafeValue, SAFE_VALUES>,
     /// The exchanges of all recipes; recipes refer to ranges of it.
     pub exchanges: Vec<Exchange, EXCHANGES>,
-    /// The frames of exchanges, which refer to it; Modbus has none.
+    /// The frames of exchanges, which refer to them; Modbus has none.
     pub frames: Vec<FrameSpec, EXCHANGES>,
 }
 
@@ -173,7 +172,7 @@ impl<
         }
     }
 
-    /// A view of the same type for every size, as the engine, the checks and the image take it.
+    /// A view whose type is the same for every size; engine, checks and image use it.
     pub fn view(&self) -> ConfigView<'_> {
         ConfigView {
             controller: &self.controller,
@@ -188,7 +187,7 @@ impl<
         }
     }
 
-    /// A mutable view of the same type for every size.
+    /// A mutable view whose type is the same for every size.
     pub(crate) fn view_mut(&mut self) -> ConfigMut<'_> {
         ConfigMut {
             controller: &mut self.controller,
@@ -207,7 +206,7 @@ impl<
     /// Checks everything that can be checked without the controller.
     ///
     /// # Errors
-    /// The first mistake, with its place and the numbers.
+    /// The first error, with its place and numbers.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.view().validate()
     }
@@ -243,12 +242,12 @@ impl<
     }
 }
 
-/// The controller's side of the gateway.
+/// The controller's address, ports, dialect and recipe link.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[non_exhaustive]
 pub struct ControllerLink {
-    /// Address or host name; empty on a board that learns it otherwise.
+    /// Address or host name; empty on a board that learns it in another way.
     pub address: String<MAX_ADDRESS>,
     /// Name of the dialect (see [`crate::wire::dialect`]).
     pub dialect: String<16>,
@@ -258,7 +257,7 @@ pub struct ControllerLink {
     pub state_port: u16,
     /// Modbus port, normally 502.
     pub modbus_port: u16,
-    /// The controller's UDP 2011 recipe server, if it is set to one of our recipes.
+    /// The controller's UDP recipe server, if it is set to one of our recipes.
     pub recipe_link: Option<RecipeLink>,
 }
 
@@ -274,17 +273,16 @@ impl ControllerLink {
         }
     }
 
-    /// Sets the dialect, and the Modbus port that a controller of this dialect has.
+    /// Sets the dialect and its Modbus port.
     pub fn set_dialect(&mut self, dialect: Dialect) {
         self.modbus_port = dialect.modbus_port;
-        // The names of the table are short.
+        // All dialects' names fit.
         self.dialect = String::try_from(dialect.name).unwrap_or_default();
     }
 }
 
 impl Default for ControllerLink {
-    /// The defaults of a file that gives only an address: dialect v2.3, ports 2000, 2001 and 502,
-    /// no recipe link.
+    /// The defaults of a file with only an address: dialect v2.3, ports 2000, 2001 and 502, no recipe link.
     fn default() -> Self {
         let mut link = Self { command_port: 2000, state_port: 2001, ..Self::none() };
         link.set_dialect(Dialect::V2_3);
@@ -292,7 +290,7 @@ impl Default for ControllerLink {
     }
 }
 
-/// The controller's own recipe port, used as the fast way up.
+/// The controller's own recipe port, used as the fast route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RecipeLink {

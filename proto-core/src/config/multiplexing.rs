@@ -1,8 +1,6 @@
-//! Frames with one CAN id, which a constant tells apart: multiplexed ones, in the words of CAN
-//! databases.
+//! Frames with the same CAN id that a constant tells apart (multiplexed messages in CAN databases).
 //!
-//! In: the fields of frames. Out: which of their bits are always the same, and whether two frames
-//! differ in one of them.
+//! In: the fields of frames. Out: which bits of a frame are constant, and whether two frames differ in one of them.
 
 use super::{ConfigView, DeviceFrame, FieldSpec, FrameSpec, OutputBinding, Parts, Recipe};
 use crate::device::{Carrier, Encoding, Kind, LayoutError, Overflow, Part};
@@ -10,11 +8,11 @@ use crate::recipe::model::Mode;
 use crate::sysvar::Direction;
 use crate::wire::can::{CanId, MAX_CAN_DATA};
 
-/// The bytes that are looked at: all of a CAN frame, and the first ones of a frame on a line.
+/// Number of bytes compared: a whole CAN frame, and the first bytes of a frame on a line.
 const LOOKED_AT: usize = 32;
 const _: () = assert!(LOOKED_AT >= MAX_CAN_DATA);
 
-/// The bits at the beginning of a frame that are the same in every frame.
+/// The constant bits at the beginning of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Constants {
     mask: [u8; LOOKED_AT],
@@ -22,12 +20,12 @@ pub struct Constants {
 }
 
 impl Constants {
-    /// Those of a frame with these fields; none if it cannot be laid out.
+    /// The constant bits of a frame with these fields; none if its layout is invalid.
     pub fn of(fields: &[FieldSpec], part: Direction) -> Self {
         Self::of_frame(DeviceFrame::new(Carrier::Can, part, (&[], &[]), fields), &[], fields)
     }
 
-    /// Those of a frame that was laid out, with its head.
+    /// The constant bits of a frame with its head and layout.
     fn of_frame(frame: Result<DeviceFrame, LayoutError>, head: &[u8], fields: &[FieldSpec]) -> Self {
         let mut constants = Self::default();
         let Ok(frame) = frame else { return constants };
@@ -50,7 +48,7 @@ impl Constants {
             return;
         }
         match encoding.kind {
-            // All ones, beside the other bits of the number.
+            // -1 sets all bits; other bits of the number are kept.
             Kind::Bits(_) => {
                 encoding.write(-1.0, mask);
             }
@@ -59,13 +57,13 @@ impl Constants {
         encoding.write(value, bytes);
     }
 
-    /// Whether each of these bits is the same in every frame of the other, too.
+    /// Whether each of these bits is also constant, with the same value, in the other frame.
     fn are_all_of(&self, other: &Self) -> bool {
         let is_new = self.mask.iter().zip(&other.mask).any(|(own, other)| own & !other != 0);
         !is_new && !self.differ(other)
     }
 
-    /// Whether a bit that is the same in every frame of both is not the same in both.
+    /// Whether a bit is constant in both frames, with different values.
     pub fn differ(&self, other: &Self) -> bool {
         let masks = self.mask.iter().zip(&other.mask).map(|(one, other)| one & other);
         let values = self.value.iter().zip(&other.value).map(|(one, other)| one ^ other);
@@ -74,7 +72,7 @@ impl Constants {
 }
 
 impl FrameSpec {
-    /// Whether no bytes are both this frame and the other one, as frames from a device.
+    /// Whether no received bytes can match both frames.
     pub(crate) fn is_distinct_from(&self, other: &Self, config: ConfigView<'_>) -> bool {
         if self.id != other.id {
             return true;
@@ -90,8 +88,8 @@ impl FrameSpec {
         constants(self).differ(&constants(other))
     }
 
-    /// Whether all bytes that are the other frame are this one too, as frames from a device, if it is looked for first;
-    /// or begin with it on a line, whichever is.
+    /// Whether all received bytes that match the other frame also match this one, if this one is checked first. On a
+    /// line also whether they begin with this one, in any order.
     pub(crate) fn hides(&self, other: &Self, is_first: bool, config: ConfigView<'_>) -> bool {
         let lengths =
             |frame: &Self| frame.layout(config, Direction::Input).ok().map(|frame| frame.layout.lengths());
@@ -112,7 +110,7 @@ impl FrameSpec {
                     && !is_summed(self))
     }
 
-    /// Whether this frame from a device may have the bytes of that request.
+    /// Whether this received frame may have the bytes of that request.
     pub(crate) fn may_echo(&self, request: &Self, config: ConfigView<'_>) -> bool {
         let lengths =
             |frame: &Self, part| frame.layout(config, part).ok().map(|frame| frame.layout.lengths());
@@ -131,7 +129,7 @@ impl FrameSpec {
     }
 }
 
-/// How a constant is written, and its value as it is sent.
+/// The encoding and the value of a constant.
 fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
     let (encoding, overflow, value) = match *field {
         FieldSpec::Fixed { encoding, value } => (encoding, Overflow::Usual, value as f64),
@@ -147,8 +145,8 @@ fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
 }
 
 impl<'c> ConfigView<'c> {
-    /// The CAN ids of the frames that a device sends to a port with this recipe (input), or that the
-    /// port sends (output), those of exchanges included; each once.
+    /// The CAN ids of the frames that a port with this recipe receives (input) or sends (output), including those of
+    /// exchanges; each id once.
     pub fn can_ids(self, recipe: &'c Recipe, part: Direction) -> impl Iterator<Item = CanId> + 'c {
         let all = move || self.all_can_ids(recipe, part);
         all()
@@ -171,7 +169,7 @@ impl<'c> ConfigView<'c> {
 }
 
 impl Recipe {
-    /// Whether frames of a part have one id: only frames of devices do.
+    /// Whether frames of a part share an id, which only devices' recipes allow.
     pub(crate) fn repeats_ids(&self) -> bool {
         let Parts::Can { input, output } = &self.parts else { return false };
         self.mode == Mode::User
@@ -181,7 +179,7 @@ impl Recipe {
                     .any(|(nth, frame)| frames.iter().take(nth).any(|before| before.id == frame.id))
             })
     }
-    /// Whether a frame without data is sent: only to devices.
+    /// Whether a frame without data is sent, which only devices' recipes allow.
     pub(crate) fn sends_empty(&self) -> bool {
         let Parts::Can { output, .. } = &self.parts else { return false };
         self.mode == Mode::User && output.iter().any(|frame| frame.fields.len == 0)

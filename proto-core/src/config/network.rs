@@ -2,7 +2,7 @@
 
 use core::net::Ipv4Addr;
 
-/// A static IPv4 address and its network. A host ignores it.
+/// A static IPv4 address and its network. Ignored on a host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Network {
@@ -16,8 +16,8 @@ pub struct Network {
     pub dns: Option<Ipv4Addr>,
 }
 
-/// Where a board's address comes from. A tag of its own makes DHCP all zeros, so that an empty
-/// configuration takes no flash.
+/// The source of the board's address. An explicit enum represents DHCP as all zeros, so an empty configuration takes no
+/// flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[repr(u8)]
@@ -55,7 +55,7 @@ impl Network {
         u32::MAX.checked_shl(32_u32.saturating_sub(self.prefix.into())).unwrap_or(0)
     }
 
-    /// Whether the address can be that of a host in this network.
+    /// Whether the address can be a host's in this network.
     pub(super) fn is_host(&self, address: Ipv4Addr) -> bool {
         let host = address.to_bits() & !self.mask();
         is_unicast(address) && self.contains(address) && host != 0 && host != !self.mask()

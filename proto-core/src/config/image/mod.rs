@@ -1,16 +1,13 @@
-//! The configuration image: what a board stores instead of the TOML file (docs/configuration.md
-//! section 6).
+//! The configuration image: the form in which a board stores its configuration (docs/configuration.md section 6).
 //!
-//! In: a checked configuration, or bytes from flash or a file. Out: the other. An image of an older
-//! version is migrated. An image that was cut short, damaged in any bit, written for a newer
-//! version, or that holds an invalid configuration is refused with a reason. Bytes after the image
-//! are ignored, because flash is erased in whole sectors. [`Scan`] reads one without keeping what is in
-//! it, where there is no room for a second configuration.
+//! In: a checked configuration, or bytes from flash or a file. Out: the other. An image of an older version is
+//! migrated. An image is refused with a reason if it is truncated, has a changed bit, has a newer version, or holds an
+//! invalid configuration. Bytes after the image are ignored, because flash is erased in whole sectors. [`Scan`] checks
+//! an image without keeping its contents, if there is no space for a second configuration.
 //!
-//! **To change a serialized type,** raise [`VERSION`], copy the types as they were into the module
-//! of the old version, with `From` into today's, and give `decode_into` a new first reader. What an
-//! old version reads is never changed afterwards. `tests/golden` has the images that must
-//! remain readable.
+//! **To change a serialized type,** raise [`VERSION`], copy the old types into the module of the old version, with
+//! `From` into the new ones, and add a reader for them to `decode_into`. Readers of old versions never change
+//! afterwards. `tests/golden` has the images that must remain readable.
 
 mod scan;
 mod v3;
@@ -30,15 +27,14 @@ use super::{ConfigError, ConfigMut, ConfigView, GatewayConfig};
 
 /// The first bytes of every image.
 pub const MAGIC: [u8; 4] = *b"RGCI";
-/// The version of the payload: one more for every change of a serialized type.
+/// The version of the payload, raised for every change of a serialized type.
 pub const VERSION: u32 = 4;
-/// The oldest version that is read.
+/// The oldest readable version.
 pub const OLDEST_VERSION: u32 = 3;
 /// Length of the header: magic, version, payload length and CRC-32, four bytes each, little-endian.
 pub const HEADER: usize = 16;
-/// Maximum length of an image, header included. Every configuration that a board has room for is
-/// shorter; only a file with hundreds of fields and CAN ids is longer, and is refused when the
-/// image is made.
+/// Maximum length of an image, header included. Every configuration that fits a board is shorter; only a file with
+/// hundreds of fields and CAN ids is longer, which is refused when the image is written.
 pub const MAX_IMAGE: usize = 16 * 1024;
 
 /// Why an image is refused.
@@ -52,17 +48,17 @@ pub enum ImageError {
         /// Number of bytes available.
         available: usize,
     },
-    /// It does not begin with [`MAGIC`]: erased flash, or something else.
+    /// The bytes do not begin with [`MAGIC`], such as erased flash.
     NotAnImage {
-        /// What it begins with.
+        /// The first bytes.
         found: [u8; 4],
     },
-    /// The image has an unknown version: a newer one.
+    /// The version is unknown, such as a newer one.
     Version {
         /// The image's version.
         found: u32,
     },
-    /// The header announces more bytes than an image can have.
+    /// The header's length exceeds the maximum.
     TooLong {
         /// The payload's length in the header.
         payload: u32,
@@ -74,22 +70,22 @@ pub enum ImageError {
         /// The CRC of the bytes.
         computed: u32,
     },
-    /// The payload is not a configuration; it was written with other types.
+    /// The payload does not decode: it was written with other types.
     Contents,
-    /// The image has more entries than the configuration has room for.
+    /// The image has more entries than the configuration can hold.
     TooMany {
         /// The list.
         what: Counted,
         /// Number of entries in the image.
         needed: usize,
-        /// Number of entries there is room for.
+        /// Number of entries that fit.
         room: usize,
     },
     /// The configuration is invalid.
     Config(ConfigError),
 }
 
-/// Whether a file of text can have the byte.
+/// Whether the byte may occur in a text file.
 const fn is_text(byte: u8) -> bool {
     matches!(byte, b' '..=b'~' | b'\t' | b'\n' | b'\r')
 }
@@ -144,7 +140,7 @@ impl core::error::Error for NoSpace {}
 
 /// Writes the image of a configuration in the newest version, and returns its length.
 ///
-/// The configuration is checked when the image is read, not here.
+/// The configuration is not checked here, but when the image is read.
 ///
 /// ```
 /// use proto_core::config::{GatewayConfig, Port, Recipe, image};
@@ -168,7 +164,7 @@ impl core::error::Error for NoSpace {}
 /// ```
 ///
 /// # Errors
-/// [`NoSpace`] when `out` is too short.
+/// [`NoSpace`] if `out` is too short.
 pub fn encode<'c>(config: impl Into<ConfigView<'c>>, out: &mut [u8]) -> Result<usize, NoSpace> {
     encode_view(config.into(), out)
 }
@@ -186,21 +182,21 @@ fn encode_view(config: ConfigView<'_>, out: &mut [u8]) -> Result<usize, NoSpace>
     Ok(HEADER.saturating_add(payload.len()))
 }
 
-/// Reads an image and checks the configuration in it.
+/// Decodes an image and checks the configuration.
 ///
 /// # Errors
-/// [`ImageError`] says what is wrong with it.
+/// [`ImageError`], with the reason.
 pub fn decode(bytes: &[u8]) -> Result<GatewayConfig, ImageError> {
     let mut config = GatewayConfig::empty();
     decode_into(bytes, &mut config)?;
     Ok(config)
 }
 
-/// Same as [`decode`], in place and into a configuration of any size: for boards whose stack is
-/// smaller than a few configurations of almost 60 KiB each.
+/// Like [`decode`], but in place and into a configuration of any size: for boards whose stack is smaller than a few
+/// configurations of almost 60 KiB each.
 ///
 /// # Errors
-/// Same as [`decode`]; `config` must not be used then.
+/// Those of [`decode`]; do not use `config` then.
 pub fn decode_into<
     const PORTS: usize,
     const RECIPES: usize,
@@ -229,7 +225,7 @@ fn decode_view(bytes: &[u8], mut config: ConfigMut<'_>) -> Result<(), ImageError
     config.view().validate().map_err(ImageError::Config)
 }
 
-/// What is in front of the lists: the controller, and the board's address.
+/// Reads the data before the lists: the controller, and the board's address.
 fn read_head(version: u32, rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<(), ImageError> {
     match version {
         3 => v3::read_head(rest, config),
@@ -237,7 +233,7 @@ fn read_head(version: u32, rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Resu
     }
 }
 
-/// The number of entries of a list.
+/// Reads the number of entries of a list.
 fn count(rest: &mut &[u8], what: Counted, room: usize) -> Result<usize, ImageError> {
     let needed: usize = item(rest)?;
     if needed > room {
@@ -246,7 +242,7 @@ fn count(rest: &mut &[u8], what: Counted, room: usize) -> Result<usize, ImageErr
     Ok(needed)
 }
 
-/// The next entries of a list, behind those that are there.
+/// Appends the next entries to a list.
 fn read_entries(
     version: u32,
     list: Counted,
@@ -266,14 +262,14 @@ fn item<T: DeserializeOwned>(rest: &mut &[u8]) -> Result<T, ImageError> {
     Ok(item)
 }
 
-/// So many entries, which may be of an older version's type.
+/// Reads this many entries, whose type may be that of an older version.
 fn items<T: DeserializeOwned + Into<Today>, Today>(
     rest: &mut &[u8],
     count: usize,
     all: &mut VecView<Today>,
 ) -> Result<(), ImageError> {
     for _ in 0..count {
-        // Not by `item`: each result that is passed on is copied, and recipes are large.
+        // Does not use `item`, which copies each result once more; recipes are large.
         let mut reader = Deserializer::from_bytes(rest);
         let pushed = match T::deserialize(&mut reader) {
             Ok(item) => all.push(item.into()).is_ok(),
@@ -288,7 +284,7 @@ fn items<T: DeserializeOwned + Into<Today>, Today>(
 }
 
 impl ConfigMut<'_> {
-    /// Empties a list; returns how many entries it has room for.
+    /// Empties a list and returns its capacity.
     fn clear(&mut self, list: Counted) -> usize {
         fn clear<T>(all: &mut VecView<T>) -> usize {
             all.clear();
@@ -307,16 +303,16 @@ impl ConfigMut<'_> {
     }
 }
 
-/// The length of the image whose header is at the start of `bytes`.
+/// The length of the image with its header at the front of `bytes`.
 ///
 /// # Errors
-/// [`ImageError`] if it is not a header, or if the announced length is not possible.
+/// [`ImageError`] if there is no header, or its length is invalid.
 pub fn image_len(bytes: &[u8]) -> Result<usize, ImageError> {
     let (_, length, _) = header(bytes)?;
     Ok(HEADER.saturating_add(length as usize))
 }
 
-/// Version, payload length and CRC.
+/// Version, payload length and CRC of the header.
 fn header(bytes: &[u8]) -> Result<(u32, u32, u32), ImageError> {
     let too_short = ImageError::TooShort { needed: HEADER, available: bytes.len() };
     let header: &[u8; HEADER] = bytes.first_chunk().ok_or(too_short)?;
@@ -336,17 +332,17 @@ fn header(bytes: &[u8]) -> Result<(u32, u32, u32), ImageError> {
     Ok((version, length, u32::from_le_bytes(crc)))
 }
 
-/// The CRC-32 of an image that is whole and of a version that is read; the configuration in it is not looked at.
+/// The CRC-32 of an image, which must be complete and of a readable version. Does not check the configuration.
 ///
 /// # Errors
-/// [`ImageError`] says what is wrong with the image.
+/// [`ImageError`], with the reason.
 pub fn intact(bytes: &[u8]) -> Result<u32, ImageError> {
     payload(bytes)?;
     let (_, _, crc) = header(bytes)?;
     Ok(crc)
 }
 
-/// The version and the payload.
+/// Checks an image and returns its version and payload.
 fn payload(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
     let (version, length, stored) = header(bytes)?;
     let needed = HEADER.saturating_add(length as usize);
@@ -358,7 +354,7 @@ fn payload(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
     Ok((version, payload))
 }
 
-/// Over version, length and payload: the header must be intact as well.
+/// Covers version, length and payload, so a damaged header is detected too.
 fn checksum(version: u32, length: u32, payload: &[u8]) -> u32 {
     let mut digest = CRC.digest();
     digest.update(&version.to_le_bytes());

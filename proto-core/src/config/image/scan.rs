@@ -1,8 +1,7 @@
-//! An image is read piece by piece, and nothing of it is kept.
+//! Checks an image piece by piece without keeping it.
 //!
-//! In: the bytes of an image, again for each piece. Out: the first thing that is wrong with them, or the buses of the
-//! ports. It refuses what `decode_into` refuses, but for what only a whole configuration shows: that its parts fit
-//! together.
+//! In: the same bytes of an image in each step. Out: the first error in them, or the buses of the ports. Refuses what
+//! `decode_into` refuses, except for errors that only a complete configuration shows.
 
 use heapless::Vec;
 
@@ -12,8 +11,8 @@ use crate::config::{
     Bus, GatewayConfig, MAX_ALL_FIELDS, MAX_COMMANDS, MAX_EXCHANGES, MAX_PORTS, MAX_RECIPES, MAX_SAFE_VALUES,
 };
 
-/// How far an image was read. A board looks at one this way that it is only to keep, and lets other work be done
-/// between two steps: a second configuration beside the one that runs has almost 60 KiB.
+/// Progress of checking an image. A board uses this for an image that it only stores, because a second configuration
+/// takes almost 60 KiB. Other work can be done between two steps.
 ///
 /// ```
 /// use proto_core::config::image::{self, Scan};
@@ -35,33 +34,33 @@ use crate::config::{
 /// ```
 #[derive(Debug, Clone, Default)]
 pub struct Scan {
-    /// Bytes of the payload that were read.
+    /// Number of payload bytes read.
     at: usize,
-    /// Lists that were begun.
+    /// Number of lists started.
     lists: usize,
-    /// Entries of the newest one that follow.
+    /// Remaining entries of the newest list.
     left: usize,
     buses: Vec<Bus, MAX_PORTS>,
 }
 
 impl Scan {
-    /// Nothing was read yet.
+    /// A scan that has read nothing.
     pub const fn new() -> Self {
         Self { at: 0, lists: 0, left: 0, buses: Vec::new() }
     }
 
-    /// Reads on: the head and its checksum, or a few entries of a list. Returns whether there is more. The bytes must be
-    /// the same each time; if they are not, some step refuses them or what they contain is not known.
+    /// Reads the head and checks the CRC, or reads a few entries of a list. Returns whether there is more. Pass the
+    /// same bytes each time: otherwise, a step may fail, or the contents were not checked.
     ///
     /// # Errors
-    /// [`ImageError`], but never [`ImageError::Config`]. No step must follow.
+    /// [`ImageError`], but never [`ImageError::Config`]. Do not call it again then.
     pub fn step(&mut self, bytes: &[u8]) -> Result<bool, ImageError> {
         let (version, all) = match self.at {
             0 => payload(bytes)?,
             _ => unchecked(bytes)?,
         };
         let mut rest = all.get(self.at..).ok_or(ImageError::Contents)?;
-        // One entry of each list: what was read before is dropped.
+        // Space for one entry of each list; earlier ones are dropped.
         let mut one = GatewayConfig::<1, 1, 1, 1, 1, 1>::empty();
         let mut config = one.view_mut();
         if self.at == 0 {
@@ -81,7 +80,7 @@ impl Scan {
             if *list == Counted::Ports
                 && let Some(port) = config.ports.first()
             {
-                // There is room for as many as were counted.
+                // Cannot fail: the count was checked.
                 let _ = self.buses.push(port.bus.clone());
             }
         }
@@ -93,13 +92,13 @@ impl Scan {
         Ok(is_more)
     }
 
-    /// The buses of the ports, in their order, once all was read.
+    /// The buses of the ports in their order, once everything is read.
     pub fn buses(&self) -> &[Bus] {
         &self.buses
     }
 }
 
-/// Version and payload of an image whose checksum was right before.
+/// Version and payload of an image with a checked CRC.
 fn unchecked(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
     let (version, length, _) = header(bytes)?;
     let needed = HEADER.saturating_add(length as usize);
@@ -107,7 +106,7 @@ fn unchecked(bytes: &[u8]) -> Result<(u32, &[u8]), ImageError> {
     Ok((version, payload.ok_or(ImageError::TooShort { needed, available: bytes.len() })?))
 }
 
-/// Entries that the configuration of a board has room for.
+/// Number of entries that fit a board's configuration.
 const fn room(list: Counted) -> usize {
     match list {
         Counted::Recipes => MAX_RECIPES,
@@ -120,5 +119,5 @@ const fn room(list: Counted) -> usize {
     }
 }
 
-/// Entries, or lists, of one step.
+/// Number of entries, or lists, per step.
 const AT_ONCE: usize = 8;

@@ -1,4 +1,4 @@
-//! Images that survive, and everything that is refused.
+//! Images that are read back unchanged, and images that are refused.
 
 use std::string::ToString;
 use std::vec;
@@ -42,9 +42,9 @@ fn every_changed_byte_and_bit_is_refused() {
             let refused = decode(&damaged).expect_err("a changed byte");
             let expected = match place {
                 0..4 => matches!(refused, ImageError::NotAnImage { .. }),
-                // Another version that is read has another CRC.
+                // Changed to another readable version: wrong CRC.
                 4..8 => matches!(refused, ImageError::Version { .. } | ImageError::Crc { .. }),
-                // A longer payload is cut short or too long; a shorter one has another CRC.
+                // A longer payload: truncated or too long. A shorter one: wrong CRC.
                 8..12 => matches!(
                     refused,
                     ImageError::TooShort { .. } | ImageError::TooLong { .. } | ImageError::Crc { .. }
@@ -81,7 +81,7 @@ fn nothing_of_the_previous_configuration_remains() {
     assert_eq!(config, small);
 }
 
-/// Lists that an older version does not have are empty, whatever was there.
+/// Lists that an older version lacks are emptied.
 #[test]
 fn nothing_of_a_newer_configuration_remains_in_an_older_one() {
     let old = include_bytes!("../../../tests/golden/v3/serial.img");
@@ -92,7 +92,7 @@ fn nothing_of_a_newer_configuration_remains_in_an_older_one() {
     assert_eq!(Ok(config), decode(old));
 }
 
-/// A whole scan.
+/// Scans an image to its end.
 fn scanned(image: &[u8]) -> Result<Scan, ImageError> {
     let mut scan = Scan::new();
     while scan.step(image)? {}
@@ -121,7 +121,7 @@ fn a_scan_finds_what_reading_finds_but_for_what_parts_say_together() {
     }
 }
 
-/// The image can be read piece by piece or as a whole.
+/// The image can be read in pieces or as a whole.
 #[test]
 fn the_payload_is_the_configuration_in_postcard() {
     let image = image();

@@ -1,6 +1,6 @@
-//! Version 3: before events of exchanges. Frozen: what it reads never changes.
+//! Version 3: before events of exchanges. Frozen: its reader never changes.
 //!
-//! Exchanges and ports as they were then, each with `From` into today's; what else the lists have is that of today.
+//! Old types of exchanges and ports, each with `From` into the new type; the lists' other types are unchanged.
 
 use serde::Deserialize;
 
@@ -73,7 +73,7 @@ impl From<PortV3> for config::Port {
     }
 }
 
-/// Its repetitions were those of events, too: they are not repeated any more.
+/// Repetitions also applied to events, which are not repeated any more.
 #[derive(Deserialize)]
 struct Exchange {
     peer: u8,

@@ -1,6 +1,6 @@
-//! Version 4, the newest: the configuration's own types, as postcard writes them one after the other.
+//! Version 4, the newest: the configuration's own types in postcard format.
 //!
-//! A change of one of these types raises the version, and leaves a copy of the old type here.
+//! To change one of these types, raise the version and keep a copy of the old type here.
 
 use serde::Serialize;
 
@@ -10,8 +10,7 @@ use crate::config::{
     BoardAddress, CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, Port, Recipe, SafeValue,
 };
 
-/// A whole configuration, borrowed. Postcard writes a struct as its fields, and a list as its length
-/// and its items.
+/// A whole configuration, borrowed. Postcard writes a struct as its fields, and a list as its length and its items.
 #[derive(Serialize)]
 struct Payload<'c> {
     controller: &'c ControllerLink,
@@ -40,7 +39,7 @@ pub(super) fn read_head(rest: &mut &[u8], config: &mut ConfigMut<'_>) -> Result<
     Ok(())
 }
 
-/// The lists of [`Payload`], in their order: the same in all versions that are read.
+/// The lists of [`Payload`] in their order, which is the same in all readable versions.
 pub(super) static LISTS: [Counted; 7] = [
     Counted::Recipes,
     Counted::Ports,
