@@ -125,8 +125,7 @@ pub enum Transaction {
         /// The fields that a master reads.
         read: Span,
     },
-    /// Frames of the device's own, as indices into
-    /// [`GatewayConfig::frames`](super::GatewayConfig::frames).
+    /// Frames of the device's own, as indices into [`GatewayConfig::frames`](super::GatewayConfig::frames).
     Frames {
         /// The request; without one the reply may arrive at any time.
         request: Option<u8>,

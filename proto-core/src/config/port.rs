@@ -1,6 +1,6 @@
-//! Ports as the configuration has them: bus, recipe, times, safe values.
+//! Ports in the configuration: bus, recipe, times, safe values.
 //!
-//! Plain data: nothing here has been checked.
+//! Plain data: nothing here is checked.
 
 use core::ops::RangeInclusive;
 
@@ -15,34 +15,34 @@ use crate::time::Duration;
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[non_exhaustive]
 pub struct Port {
-    /// Its name, as `--bind` and `--stats` use it.
+    /// The name, which `--bind` and `--stats` use.
     pub name: Name,
-    /// Its bus.
+    /// The bus.
     pub bus: Bus,
     /// Index into [`GatewayConfig::recipes`](super::GatewayConfig::recipes).
     pub recipe: u8,
-    /// How often the output part is sent; at least 4 ms.
+    /// Cycle in which the output part is sent; at least 4 ms.
     pub cycle: Duration,
-    /// After this long without an accepted frame the port's inputs take their safe values;
-    /// [`Port::NEVER`] for a device that sends only events.
+    /// After this time without an accepted frame the port's inputs take their safe values. [`Port::NEVER`] for a device
+    /// that sends only on events.
     pub timeout: Duration,
-    /// The safe values that inputs take then; inputs without a safe value hold.
+    /// The safe values that inputs take after the timeout; inputs without a safe value hold.
     pub on_timeout: Span,
     /// Outputs whose source is older than this are stale.
     pub stale_after: Duration,
-    /// The variables that tell the robot the port's health.
+    /// The variables that report the port's health to the robot.
     pub health: PortHealth,
-    /// Whether inputs have their safe values from the start until their device speaks.
+    /// Whether inputs have their safe values from the start until the device sends a frame.
     pub safe_at_start: bool,
-    /// A recipe that is sent on change is also sent after this long without a change.
+    /// A recipe that is sent on change is also sent after this time without a change.
     pub refresh: Option<Duration>,
-    /// A peer of the recipe's exchanges that was not heard for this long has started anew when it is heard again.
+    /// A peer of the recipe's exchanges counts as restarted if it is heard after this time without a frame.
     pub absent: Duration,
 }
 
 impl Port {
-    /// The timeout of a port that is never overdue: it works from the start, and its values hold. A
-    /// hundred years, so that instants behind it can still be told from no instant at all.
+    /// The timeout of a port that is never overdue: it works from the start, and its values hold. It is a hundred
+    /// years, so that sums with it differ from [`Instant::NEVER`](crate::time::Instant::NEVER).
     pub const NEVER: Duration = Duration::from_secs(100 * 365 * 86_400);
 
     /// The default of [`Self::timeout`].
@@ -54,8 +54,8 @@ impl Port {
     /// The default of [`Self::absent`].
     pub const ABSENT: Duration = Duration::from_secs(3);
 
-    /// A port with the file's defaults: a cycle of 4 ms, a timeout of 100 ms, stale after 500 ms, and
-    /// inputs that hold, also at the start.
+    /// A port with the defaults of files: a cycle of 4 ms, a timeout of 100 ms, stale after 500 ms; inputs hold, also
+    /// at the start.
     pub const fn new(name: Name, bus: Bus, recipe: u8) -> Self {
         Self {
             name,
@@ -77,28 +77,28 @@ impl Port {
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Bus {
-    /// Half-duplex serial line on the field side.
+    /// Half-duplex serial line with field devices.
     Rs485(Rs485),
-    /// CAN bus on the field side.
+    /// CAN bus with field devices.
     Can {
-        /// Bit/s, 10_000..=1_000_000; a file's default is [`Bus::BITRATE`].
+        /// Bit/s, 10_000..=1_000_000; the default in files is [`Bus::BITRATE`].
         bitrate: u32,
     },
-    /// Where the controller's TCP client connects to: a way up, like the recipe link.
+    /// The controller's TCP client connects here: a route to the controller, like the recipe link.
     TcpListen {
         /// Address and port, such as `0.0.0.0:50000`.
         listen: String<MAX_LISTEN>,
     },
-    /// Where the controller's UDP client sends to: a way up, like the recipe link.
+    /// The controller's UDP client sends here: a route to the controller, like the recipe link.
     UdpListen {
         /// Address and port.
         listen: String<MAX_LISTEN>,
     },
-    /// Devices on the field side, of which the gateway is the Modbus TCP client over one connection.
+    /// Field devices, with the gateway as Modbus TCP client on one connection.
     ModbusTcp {
         /// IP address or host name.
         host: String<MAX_ADDRESS>,
-        /// TCP port; a file's default is [`Bus::MODBUS_TCP`].
+        /// TCP port; the default in files is [`Bus::MODBUS_TCP`].
         port: u16,
     },
 }
@@ -106,12 +106,12 @@ pub enum Bus {
 impl Bus {
     /// Default bit rate of a CAN bus, in bit/s.
     pub const BITRATE: u32 = 500_000;
-    /// The bit rates that a CAN bus can have.
+    /// Allowed bit rates of a CAN bus.
     pub const BITRATES: RangeInclusive<u32> = 10_000..=1_000_000;
-    /// Default TCP port of Modbus.
+    /// Default TCP port for Modbus.
     pub const MODBUS_TCP: u16 = 502;
 
-    /// Whether devices (not the controller) are at the other end.
+    /// Whether field devices (not the controller) are connected.
     pub const fn is_field(&self) -> bool {
         match self {
             Self::Rs485(_) | Self::Can { .. } | Self::ModbusTcp { .. } => true,
@@ -119,7 +119,7 @@ impl Bus {
         }
     }
 
-    /// Whether frames are CAN frames, and several nodes send whenever the bus is free.
+    /// Whether it carries CAN frames, and nodes send whenever the bus is free.
     pub const fn is_can(&self) -> bool {
         match self {
             Self::Can { .. } => true,
@@ -129,7 +129,7 @@ impl Bus {
         }
     }
 
-    /// Whether it is a connection of the gateway's own, on which transaction ids tell replies apart.
+    /// Whether it is an outgoing connection, on which transaction ids tell replies apart.
     pub const fn is_modbus_tcp(&self) -> bool {
         match self {
             Self::ModbusTcp { .. } => true,
@@ -148,30 +148,30 @@ pub struct Rs485 {
     pub parity: Parity,
     /// 1 or 2.
     pub stop_bits: u8,
-    /// A partial frame is discarded after the line has been silent for this long.
+    /// A partial frame is discarded after this silence.
     pub idle_gap: Duration,
-    /// The line must have been silent for this long before a frame is sent.
+    /// Minimum silence before a frame is sent.
     pub turnaround: Duration,
-    /// Whether what is sent is heard as well. Only with a recipe of exchanges.
+    /// Whether sent bytes are also received. Only with a recipe of exchanges.
     pub echo: Echo,
 }
 
-/// Whether a line gives back what is sent on it, as a 2-wire adapter does whose receiver is always on.
+/// Whether a line echoes sent bytes, like a 2-wire adapter whose receiver is always on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Echo {
-    /// Only others are heard.
+    /// No echo.
     No,
-    /// Each own byte is heard.
+    /// Each sent byte is received.
     Yes,
-    /// It is learned from an exchange whose reply differs from its request, each time that the line is opened. Until
-    /// then a reply that equals its request confirms nothing.
+    /// Learned from an exchange whose reply differs from its request, each time the line is opened. Until then a reply
+    /// that equals its request confirms nothing.
     #[default]
     Auto,
 }
 
 impl Echo {
-    /// What is known before anything was heard.
+    /// The setting, unless it is learned.
     pub(crate) const fn known(self) -> Option<bool> {
         match self {
             Self::No => Some(false),
@@ -182,19 +182,19 @@ impl Echo {
 }
 
 impl Default for Rs485 {
-    /// The defaults of a file: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a
-    /// turnaround of 100 µs, an echo that is learned.
+    /// The defaults of files: 115 200 bit/s, no parity, 1 stop bit, an idle gap of 50 ms, a turnaround of 100 µs, an
+    /// echo that is learned.
     fn default() -> Self {
         Self::DEFAULT
     }
 }
 
 impl Rs485 {
-    /// The speeds that a line can have, in bit/s.
+    /// Allowed bit rates in bit/s.
     pub const BAUD: RangeInclusive<u32> = 1_200..=4_000_000;
-    /// The stop bits that it can have.
+    /// Allowed numbers of stop bits.
     pub const STOP_BITS: RangeInclusive<u8> = 1..=2;
-    /// Its default.
+    /// The default settings.
     pub const DEFAULT: Self = Self {
         baud: 115_200,
         parity: Parity::None,
@@ -204,16 +204,16 @@ impl Rs485 {
         echo: Echo::Auto,
     };
 
-    /// The same with the silence of Modbus RTU as turnaround: 3.5 characters, or 1750 µs above
-    /// 19 200 bit/s (docs/wire/modbus-rtu.md section 2). For a master, which knows how long a reply
-    /// is: the idle gap stays, because systems and adapters deliver a reply in pieces.
+    /// Sets the turnaround to the silence of Modbus RTU: 3.5 characters, or 1750 µs above 19 200 bit/s
+    /// (docs/wire/modbus-rtu.md section 2). For a master, which knows the length of a reply: the idle gap is unchanged,
+    /// because systems and adapters deliver a reply in pieces.
     #[must_use]
     pub fn with_rtu_turnaround(self) -> Self {
         Self { turnaround: self.with_rtu_silence().turnaround, ..self }
     }
 
-    /// The same with the silence of Modbus RTU as idle gap and turnaround. For a slave, to which only
-    /// the silence tells where a request ends.
+    /// Sets idle gap and turnaround to the silence of Modbus RTU. For a slave, which recognises the end of a request
+    /// only by silence.
     #[must_use]
     pub fn with_rtu_silence(self) -> Self {
         let silence = Timing::new(self.baud, self.bits_per_character() as u8).silence();
@@ -234,5 +234,5 @@ pub enum Parity {
     Odd,
 }
 
-/// The shortest cycle, of the controller and of a port.
+/// The shortest cycle of the controller and of ports.
 pub const MIN_CYCLE: Duration = Duration::from_millis(4);

@@ -1,7 +1,6 @@
-//! Recipes as the configuration has them: parts, fields and their bindings, triggers.
+//! Recipes in the configuration: parts, fields and their bindings, triggers.
 //!
-//! Plain data: nothing here has been checked. Fields and commands are ranges of the configuration's
-//! lists.
+//! Plain data: nothing here is checked. Fields and commands are ranges of the configuration's lists.
 
 use core::slice::Iter;
 
@@ -29,14 +28,13 @@ pub struct Recipe {
     pub on_stale: OnStale,
     /// What makes a port send the output part.
     pub send: SendOn,
-    /// What is asked beside the parts, a range of
-    /// [`GatewayConfig::exchanges`](super::GatewayConfig::exchanges); the parts of a stream may then
-    /// both be absent.
+    /// The exchanges besides the parts, a range of [`GatewayConfig::exchanges`](super::GatewayConfig::exchanges). With
+    /// exchanges, both parts of a stream may be absent.
     pub exchanges: Span,
 }
 
 impl Recipe {
-    /// A recipe with these parts that is sent every cycle and holds stale values.
+    /// A recipe with these parts, sent every cycle, holding stale values.
     pub const fn new(name: Name, mode: Mode, parts: Parts) -> Self {
         let exchanges = Span { start: 0, len: 0 };
         Self { name, mode, parts, on_stale: OnStale::Hold, send: SendOn::Period, exchanges }
@@ -62,7 +60,7 @@ impl Recipe {
     }
 }
 
-/// A recipe's two parts; either may be absent, and both if it has exchanges.
+/// A recipe's two parts. Either may be absent, or both if the recipe has exchanges.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[allow(clippy::large_enum_variant, reason = "without an allocator there is no box to put the larger one in")]
@@ -93,19 +91,19 @@ pub struct StreamPart {
     pub tail: Delimiter,
     /// The fields.
     pub fields: Span,
-    /// What tells its frames apart; only in recipes of devices.
+    /// How its frames are separated; only in recipes of devices.
     pub framing: Boundary,
-    /// Its frames stand between escape bytes, which then tell them apart.
+    /// Its frames are marked and escaped, which also separates them.
     pub escape: Option<Escape>,
 }
 
 impl StreamPart {
-    /// A part as the controller's recipes have it.
+    /// A part as in the controller's recipes.
     pub const fn new(head: Delimiter, tail: Delimiter, fields: Span) -> Self {
         Self { head, tail, fields, framing: Boundary::Fields, escape: None }
     }
 
-    /// Whether something else than its fields tells where frames end.
+    /// Whether the ends of frames are found by something else than their fields.
     pub(crate) fn is_cut(&self) -> bool {
         self.framing != Boundary::Fields || self.escape.is_some()
     }
@@ -137,7 +135,7 @@ impl Iterator for PartFrames<'_> {
     }
 }
 
-/// A range of one of the pools of [`GatewayConfig`](super::GatewayConfig).
+/// A range of one of the lists of [`GatewayConfig`](super::GatewayConfig).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Span {
@@ -148,19 +146,20 @@ pub struct Span {
 }
 
 impl Span {
-    /// The part of `pool` that this range covers; empty if it does not fit.
+    /// The entries of `pool` in this range; empty if the range does not fit.
     pub fn of<T>(self, pool: &[T]) -> &[T] {
         let start = usize::from(self.start);
         pool.get(start..start.saturating_add(usize::from(self.len))).unwrap_or(&[])
     }
 
-    /// The range between two lengths of a list. Lists are shorter than `u16::MAX`; the check of the counts refuses others.
+    /// The range between two lengths of a list. Lists are shorter than `u16::MAX`; longer ones are refused by the check
+    /// of counts.
     pub(super) fn between(start: usize, end: usize) -> Self {
         Self { start: start as u16, len: end.saturating_sub(start) as u16 }
     }
 }
 
-/// One field, and what the gateway does with it.
+/// A field, and its source or use.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum FieldSpec {
@@ -170,96 +169,93 @@ pub enum FieldSpec {
     UserInput {
         /// The field's type on the wire.
         ty: ScalarType,
-        /// What is done with its value.
+        /// What its value is used for.
         to: InputBinding,
     },
     /// A field of a user-defined recipe's output part.
     UserOutput {
         /// The field's type on the wire.
         ty: ScalarType,
-        /// Where its value comes from.
+        /// The source of its value.
         from: OutputBinding,
     },
     /// A field of a device's frame, in the input part of a user recipe.
     DeviceInput {
-        /// How it is written.
+        /// How it is encoded.
         encoding: Encoding,
-        /// What becomes of a number that its variable cannot hold.
+        /// What happens to a number out of the variable's range.
         overflow: Overflow,
-        /// What is done with its value.
+        /// What its value is used for.
         to: InputBinding,
     },
     /// A field of a device's frame, in the output part of a user recipe.
     DeviceOutput {
-        /// How it is written.
+        /// How it is encoded.
         encoding: Encoding,
-        /// What becomes of a number that it cannot hold.
+        /// What happens to a number out of the field's range.
         overflow: Overflow,
-        /// Where its value comes from.
+        /// The source of its value.
         from: OutputBinding,
     },
-    /// An integer that is the same in every frame; a received frame with another one is not this
-    /// frame.
+    /// A constant integer; a received frame with another value is not this frame.
     Fixed {
-        /// How it is written.
+        /// How it is encoded.
         encoding: Encoding,
         /// The integer.
         value: i64,
     },
-    /// Bytes without a meaning: any are accepted.
+    /// Bytes without meaning; any value is accepted.
     Padding {
         /// Number of bytes.
         len: u8,
-        /// What is sent.
+        /// The byte that is sent.
         fill: u8,
     },
-    /// The frame's checksum stands here.
+    /// The frame's checksum.
     Checksum(Checksum),
     /// A text of a device's input frame.
     TextInput {
-        /// How it is written.
+        /// How it is encoded.
         text: Text,
-        /// The registers that take it, zeros behind its end; a frame with a longer one is rejected.
+        /// The registers that take the text, padded with zeros; a frame with a longer text is rejected.
         to: Option<Words>,
-        /// The variable that becomes its number of characters.
+        /// The variable that gets the number of characters.
         length_to: Option<SysVar>,
-        /// The variable that counts the frames accepted, so that the same text twice is seen.
+        /// The variable that counts accepted frames, to show a repeated text.
         count_to: Option<SysVar>,
-        /// A frame with one of these shows that the device is there; nothing of it is taken.
+        /// A frame with one of these texts shows that the device is there; its values are ignored.
         ignored: Ignored,
     },
     /// A text of a device's output frame.
     TextOutput {
-        /// How it is written.
+        /// How it is encoded.
         text: Text,
-        /// The registers that have it.
+        /// The registers with the text.
         from: Words,
-        /// The variable that has its number of characters; without one it ends before the first
-        /// zero.
+        /// The variable with the number of characters; without one the text ends before the first zero.
         length_from: Option<SysVar>,
     },
-    /// The frame's length stands here.
+    /// The frame's length.
     Length(Length),
-    /// What the output field before this may send, or which numbers the input field before it takes; nothing stands in
-    /// the frame. Only in frames of devices.
+    /// What the previous output field may send, or which numbers the previous input field accepts. No bytes in the
+    /// frame. Only in frames of devices.
     Limits(Limits),
-    /// An entry of the table of what the output field before this sends, or of what the variable of the input field before
-    /// it becomes; nothing stands in the frame. Only in frames of devices.
+    /// An entry of the previous field's table: what an output field sends, or the number for an input field's variable.
+    /// No bytes in the frame. Only in frames of devices.
     Mapped(MapEntry),
-    /// What else becomes of the value of the input field before this; nothing stands in the frame. Only in frames of
-    /// devices.
+    /// Another rule for the value of the previous input field. No bytes in the frame. Only in frames of devices.
     InputRule(InputRule),
 }
 
-/// A run of word variables that holds a text, two characters each.
+/// Consecutive word variables that hold a text, two characters each.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Words {
-    /// The first of them.
+    /// The first variable.
     pub first: SysVar,
-    /// How many.
+    /// Number of variables.
     pub count: u8,
-    /// Big: the first character is the high byte. Little: the low one.
+    /// Big: the first character is the high byte. Little: the low byte.
     pub order: ByteOrder,
 }
 
@@ -270,7 +266,7 @@ impl Words {
         (first..end).filter_map(SysVar::from_ordinal)
     }
 
-    /// The ordinals of the first one, and of the first behind them.
+    /// The ordinals of the first variable, and of the one after the last.
     const fn ordinals(self) -> (usize, usize) {
         let first = self.first.ordinal();
         (first, first.saturating_add(self.count as usize))
@@ -283,7 +279,7 @@ impl Words {
 }
 
 impl FieldSpec {
-    /// The field as the controller's recipes have it; `None` if only frames of devices have it.
+    /// The field as in the controller's recipes; `None` if only frames of devices have it.
     pub fn field(&self) -> Option<Field> {
         match *self {
             Self::System(var) => Some(Field::System(var)),
@@ -292,7 +288,7 @@ impl FieldSpec {
         }
     }
 
-    /// Whether it only says what the field before it may send, or what becomes of its value.
+    /// Whether this is a limit, a table entry or a rule of the previous field.
     pub const fn is_of_field_before(&self) -> bool {
         matches!(self, Self::Limits(_) | Self::Mapped(_) | Self::InputRule(_))
     }
@@ -309,7 +305,7 @@ impl FieldSpec {
         }
     }
 
-    /// Where the value of a user-defined output field comes from.
+    /// The source of a user-defined output field.
     pub fn source(&self) -> Option<OutputBinding> {
         match *self {
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => Some(from),
@@ -317,7 +313,7 @@ impl FieldSpec {
         }
     }
 
-    /// The same, to change it.
+    /// The source of a user-defined output field, mutable.
     pub fn source_mut(&mut self) -> Option<&mut OutputBinding> {
         match self {
             Self::UserOutput { from, .. } | Self::DeviceOutput { from, .. } => Some(from),
@@ -325,7 +321,7 @@ impl FieldSpec {
         }
     }
 
-    /// What is done with the value of a user-defined input field.
+    /// The binding of a user-defined input field.
     pub fn target(&self) -> Option<InputBinding> {
         match *self {
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => Some(to),
@@ -333,7 +329,7 @@ impl FieldSpec {
         }
     }
 
-    /// The same, to change it.
+    /// The binding of a user-defined input field, mutable.
     pub fn target_mut(&mut self) -> Option<&mut InputBinding> {
         match self {
             Self::UserInput { to, .. } | Self::DeviceInput { to, .. } => Some(to),
@@ -341,8 +337,8 @@ impl FieldSpec {
         }
     }
 
-    /// The system variable that the field is, that an input field's value becomes as a whole, or of
-    /// which an output field shows the value or a bit; texts have several, see [`Self::variables`].
+    /// The system variable of the field: the field itself, the one that an input field writes as a whole, or the one
+    /// whose value or bit an output field shows. Texts have several; see [`Self::variables`].
     pub fn variable(&self) -> Option<SysVar> {
         match *self {
             Self::System(var) => Some(var),
@@ -386,16 +382,15 @@ impl FieldSpec {
     }
 }
 
-/// The variables of a field: words that follow each other, then single ones.
+/// The variables of a field: consecutive words, then single variables.
 #[derive(Debug, Clone)]
 pub(super) struct Variables {
-    /// Ordinals of the words that are left: the first, and the first behind them.
+    /// Ordinals of the remaining words: the first, and the one after the last.
     pub(super) words: (usize, usize),
     pub(super) others: [Option<SysVar>; 2],
 }
 
 impl Variables {
-    /// None at all.
     pub(super) const NONE: Self = Self { words: (0, 0), others: [None; 2] };
 }
 
@@ -416,11 +411,11 @@ impl Iterator for Variables {
     }
 }
 
-/// What is done with a received user-defined value.
+/// What a received user-defined value is used for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum InputBinding {
-    /// It is ignored.
+    /// Ignored.
     Unused,
     /// `value * scale + offset` becomes the variable's value.
     Variable {
@@ -431,46 +426,44 @@ pub enum InputBinding {
         /// Offset, added after scaling.
         offset: f32,
     },
-    /// The value picks a port-2000 command from a table. A value that is not in the table does
-    /// nothing; it is counted, unless it is 0 and the table names no idle values.
+    /// The value selects a port-2000 command from a table. A value that is not in the table does nothing; it is
+    /// counted, unless it is 0 and the table has no idle values.
     Commands {
         /// The table, in [`GatewayConfig::commands`](super::GatewayConfig::commands).
         table: Span,
         /// When a value takes effect.
         when: CommandWhen,
     },
-    /// One bit of a byte variable: off for 0, on for any other integer. Other bits of the byte may
-    /// have other owners.
+    /// One bit of a byte variable: off for 0, on for any other integer. Other bits of the byte may have other owners.
     Bit {
         /// An input variable made of bits.
         var: SysVar,
         /// Bit 0..=7.
         bit: u8,
     },
-    /// It goes up by one with every frame, and from `max` to 0: a frame with the number of the one
-    /// before is a repeat, and not taken. Only in frames of devices.
+    /// An alive counter, which increases by one with every frame and wraps from `max` to 0. A frame with the same
+    /// number as the previous one is a repetition and is not applied. Only in frames of devices.
     Counter {
         /// The highest number.
         max: u32,
     },
 }
 
-/// When a value that picks a command takes effect.
+/// When a value that selects a command takes effect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum CommandWhen {
-    /// When it differs from the previous frame; the first frame after silence only sets the base.
+    /// When it differs from the previous frame; the first frame after silence only sets the value to compare with.
     #[default]
     Change,
-    /// With every accepted frame: for devices that send a frame only when they mean it.
+    /// With every accepted frame: for devices that send a frame only for a command.
     Frame,
-    /// When it differs from the previous frame, also after silence: for devices that send a frame
-    /// only when something changes. After a lost device, bus-off or sleep, the first frame only
-    /// sets the base.
+    /// When it differs from the previous frame, even after silence: for devices that send a frame only on change. After
+    /// a lost device, bus-off or sleep, the first frame only sets the value to compare with.
     Kept,
 }
 
-/// Where a user-defined output value comes from.
+/// The source of a user-defined output value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum OutputBinding {
@@ -485,12 +478,11 @@ pub enum OutputBinding {
     },
     /// A constant.
     Constant(f64),
-    /// Frames sent so far, wrapping in the field's type.
+    /// Number of frames sent, wrapping in the field's type.
     Counter,
     /// The result of this port's newest command: see [`crate::engine::ReplyCode`].
     Reply,
-    /// `value * scale + offset` of the controller's newest state packet, saturated to the field's
-    /// type.
+    /// `value * scale + offset` of the controller's newest state packet, saturated to the field's type.
     State {
         /// The value.
         value: StateValue,
@@ -499,12 +491,12 @@ pub enum OutputBinding {
         /// Offset, added after scaling.
         offset: f32,
     },
-    /// The health of a field port. Counts wrap in the field's type, and take no scale and offset;
-    /// the others are `value * scale + offset`, saturated.
+    /// The health of a field port. Counts wrap in the field's type, and have no scale and offset; other values are
+    /// `value * scale + offset`, saturated.
     Port {
         /// Index of the port in the configuration; `None` is the port that sends the field.
         port: Option<u8>,
-        /// What is sent.
+        /// The value.
         value: PortValue,
         /// Scale.
         scale: f32,
@@ -518,13 +510,13 @@ pub enum OutputBinding {
         /// Bit 0..=7.
         bit: u8,
     },
-    /// Frames sent so far; `max` is followed by 0.
+    /// Number of frames sent; `max` is followed by 0.
     CounterTo {
         /// The highest number.
         max: u32,
     },
-    /// `value * scale + offset`, saturated, of 1 while the link is up and 0 otherwise, also if the
-    /// gateway does not need it.
+    /// `value * scale + offset`, saturated, where the value is 1 while the link is up and 0 otherwise, even if the
+    /// gateway does not need the link.
     Link {
         /// The link.
         link: LinkSource,
@@ -539,13 +531,12 @@ pub enum OutputBinding {
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct CommandEntry {
-    /// The first of the field's values that pick the command.
+    /// The first field value that selects the command.
     pub first: i64,
-    /// The last of them; the same as the first for a single value.
+    /// The last field value; equal to the first for a single value.
     pub last: i64,
-    /// The command as port 2000 takes it, such as `run(pick.jspf,50)`. `{value}` in it stands for
-    /// the field's value. If empty, the values are idle: they pick nothing, and are not counted as
-    /// unknown.
+    /// The command for port 2000, such as `run(pick.jspf,50)`. `{value}` is replaced by the field's value. If empty,
+    /// the values are idle: they select nothing, and are not counted as unknown.
     pub text: String<MAX_COMMAND_TEXT>,
 }
 
@@ -569,9 +560,9 @@ pub enum SendOn {
     Period,
     /// Each cycle in which a value changed.
     Change,
-    /// Every accepted input frame: request and response.
+    /// With every accepted input frame: request and response.
     Frame,
-    /// A bit going from 0 to 1.
+    /// When a bit changes from 0 to 1.
     Rising {
         /// A bit variable that the controller shows.
         var: SysVar,

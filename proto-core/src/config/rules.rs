@@ -1,6 +1,6 @@
-//! The rules for single values, and how a broken one is reported.
+//! Rules for single values, and the errors for them.
 //!
-//! In: a name, a number, a range. Out: nothing, or what is wrong with it. The reader of files and
+//! In: a name, a number, a range. Out: nothing, or an error. The reader of files and
 //! [`ConfigView::validate`](super::ConfigView::validate) use the same functions.
 
 use core::net::Ipv4Addr;
@@ -15,11 +15,11 @@ use super::{Bus, MAX_ADDRESS, MAX_NAME, Name, Network, Rs485, Span};
 use crate::sysvar::{COUNT, SysVar, VarBit};
 use crate::time::Duration;
 
-/// The longest cycle, timeout or staleness that a configuration may have.
+/// Maximum cycle, timeout or staleness.
 pub const MAX_TIME: Duration = Duration::from_secs(3_600);
-/// The longest time in which an event may be sent.
+/// Maximum time in which an event may be sent.
 pub const LONGEST_TRIGGER: Duration = Duration::from_secs(10);
-/// The longest idle gap and turnaround of a serial line.
+/// Maximum idle gap and turnaround of a serial line.
 pub const MAX_LINE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) type Check = Result<(), ConfigError>;
@@ -28,7 +28,7 @@ impl Rs485 {
     /// Checks that the settings are within their ranges (D21).
     ///
     /// # Errors
-    /// The key and what is wrong with it.
+    /// The key and the error.
     pub fn check(&self) -> Result<(), (PortKey, Kind)> {
         if !Self::BAUD.contains(&self.baud) {
             return Err((PortKey::Baud, Kind::BaudOutOfRange { baud: self.baud }));
@@ -90,7 +90,7 @@ impl Network {
     }
 }
 
-/// Checks that the variable has the bit; returns the bit in the variable's byte.
+/// Checks that the variable has the bit; returns the mask of the bit.
 ///
 /// # Errors
 /// [`ConfigErrorKind::HasNoBits`](Kind::HasNoBits) or [`ConfigErrorKind::NoSuchBit`](Kind::NoSuchBit).
@@ -103,7 +103,7 @@ pub fn check_bit(bit: VarBit) -> Result<u8, Kind> {
     }
 }
 
-/// A bit that triggers.
+/// Checks a bit that triggers.
 pub(super) fn check_trigger(place: Place, var: SysVar, bit: u8) -> Check {
     if !var.is_bits() {
         return fail(place, Kind::NotBits { var });
@@ -123,8 +123,7 @@ pub fn check_bitrate(bitrate: u32) -> Result<(), Kind> {
 /// Checks the cycle of a port: from 4 ms, the controller's fastest, to an hour.
 ///
 /// # Errors
-/// [`ConfigErrorKind::CycleTooShort`](Kind::CycleTooShort) or
-/// [`ConfigErrorKind::TimeTooLong`](Kind::TimeTooLong).
+/// [`ConfigErrorKind::CycleTooShort`](Kind::CycleTooShort) or [`ConfigErrorKind::TimeTooLong`](Kind::TimeTooLong).
 pub fn check_cycle(cycle: Duration) -> Result<(), Kind> {
     match cycle {
         _ if cycle < MIN_CYCLE => Err(Kind::CycleTooShort { cycle }),
@@ -141,8 +140,7 @@ pub(super) fn fail(place: Place, kind: Kind) -> Check {
 /// characters, so that a command line can carry it.
 ///
 /// # Errors
-/// [`ConfigErrorKind::NameLength`](Kind::NameLength) or
-/// [`ConfigErrorKind::NameCharacter`](Kind::NameCharacter).
+/// [`ConfigErrorKind::NameLength`](Kind::NameLength) or [`ConfigErrorKind::NameCharacter`](Kind::NameCharacter).
 pub fn check_name(name: &str) -> Result<(), Kind> {
     if name.is_empty() || name.len() > MAX_NAME {
         return Err(Kind::NameLength { len: name.len() });
@@ -170,7 +168,7 @@ pub fn check_address(address: &str) -> Result<(), Kind> {
     Ok(())
 }
 
-/// A valid name that no earlier recipe or port has.
+/// Checks a name, which no earlier recipe or port may have.
 pub(super) fn check_new_name<'a>(
     place: Place,
     name: &str,
@@ -190,7 +188,7 @@ pub(super) fn check_pool(place: Place, span: Span, len: usize) -> Check {
     if end <= len { Ok(()) } else { fail(place, Kind::OutsidePool { end, len }) }
 }
 
-/// A text of the configuration, at most `N` bytes long.
+/// Copies a text of at most `N` bytes.
 pub(super) fn text<const N: usize>(given: &str) -> Result<String<N>, Kind> {
     String::try_from(given).map_err(|_| Kind::TooLong { len: given.len(), longest: N })
 }
@@ -215,7 +213,7 @@ pub(super) fn is_marked(set: &[bool; COUNT], var: SysVar) -> bool {
     set.get(var.ordinal()).copied().unwrap_or(false)
 }
 
-/// Checks that there is room for so many entries.
+/// Checks that this many entries fit.
 pub(super) fn check_room(place: Place, what: Counted, needed: usize, room: usize) -> Check {
     if needed <= room { Ok(()) } else { fail(place, Kind::TooMany { what, needed, room }) }
 }

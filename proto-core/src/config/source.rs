@@ -1,8 +1,7 @@
-//! Sources of output fields beside the system variables: the controller's state packet, and the
-//! health of ports.
+//! Sources of output fields besides system variables: the controller's state packet, and the health of ports.
 //!
-//! In: names such as `controller.joint_position[1]`. Out: the row and item of the packet's table,
-//! which gives offset and type.
+//! In: names such as `controller.joint_position[1]`. Out: the row and item in the packet's table, which has offset and
+//! type.
 
 use core::fmt;
 
@@ -11,8 +10,8 @@ use crate::wire::dialect::Dialect;
 use crate::wire::scalar::ScalarType;
 use crate::wire::state::{Content, FIELDS, FieldPlace};
 
-/// A value of the controller's state packet: a row of [`FIELDS`] and an item of it, or the global
-/// speed, which only some dialects have.
+/// A value of the controller's state packet: a row of [`FIELDS`] and its item, or the global speed, which only some
+/// dialects have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct StateValue {
@@ -22,7 +21,7 @@ pub struct StateValue {
     pub item: u8,
 }
 
-/// Why a name or a place is not that of a value of the state packet.
+/// Why a name, or a row and item, is not a value of the state packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum StateValueError {
@@ -30,7 +29,7 @@ pub enum StateValueError {
     Unknown,
     /// The row is reserved: its content has no meaning.
     Reserved,
-    /// The row has several items, and the name does not say which.
+    /// The row has several items, but the name has no item number.
     NeedsItem {
         /// Number of items.
         items: u8,
@@ -40,9 +39,9 @@ pub enum StateValueError {
         /// Number of items.
         items: u8,
     },
-    /// The row has one item, so its name takes no number.
+    /// The row has only one item, but the name has an item number.
     OneItem,
-    /// The dialect's controller does not send the global speed.
+    /// The controller does not send the global speed in this dialect.
     NoSpeed,
 }
 
@@ -74,10 +73,10 @@ impl fmt::Display for StateValueError {
 
 impl core::error::Error for StateValueError {}
 
-/// The row that a file calls `mode`.
+/// The row with the name `mode` in files.
 const MODE_ROW: &str = "operation_mode";
 
-/// Number of items with a meaning: the 7th of every joint field is reserved.
+/// Number of items that are not reserved; the 7th of every joint field is.
 fn items_of(place: &FieldPlace) -> u8 {
     match place.content {
         Content::Bools { real } => real,
@@ -88,14 +87,14 @@ fn items_of(place: &FieldPlace) -> u8 {
 }
 
 impl StateValue {
-    /// The global speed in percent, which stands in a reserved row.
+    /// The global speed in percent, which is in a reserved row.
     pub const SPEED: Self = Self { row: u8::MAX, item: 0 };
 
-    /// The value of this name, without `controller.`: `mode`, `speed`, or a row of the packet's
-    /// table, with the item counted from 1 if there are several: `joint_position[1]`.
+    /// The value with this name, without `controller.`: `mode`, `speed`, or a row of the packet's table, with the item
+    /// counted from 1 if there are several: `joint_position[1]`.
     ///
     /// # Errors
-    /// [`StateValueError`] says what is wrong with the name.
+    /// [`StateValueError`], with the reason.
     pub fn parse(name: &str) -> Result<Self, StateValueError> {
         let (name, number) = match name.strip_suffix(']').and_then(|name| name.split_once('[')) {
             Some((name, number)) => (name, Some(number)),
@@ -124,7 +123,7 @@ impl StateValue {
     /// Offset in the packet, and type.
     ///
     /// # Errors
-    /// [`StateValueError`] if there is no such row or item, or none in this dialect.
+    /// [`StateValueError`] if the row or item does not exist, or not in this dialect.
     pub fn place(self, dialect: &Dialect) -> Result<(u16, ScalarType), StateValueError> {
         if self == Self::SPEED {
             let offset = dialect.global_speed.ok_or(StateValueError::NoSpeed)?;
@@ -143,7 +142,7 @@ impl StateValue {
     }
 }
 
-/// As in a file: `controller.mode`, `controller.joint_position[1]`.
+/// The name in files: `controller.mode`, `controller.joint_position[1]`.
 impl fmt::Display for StateValue {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if *self == Self::SPEED {
@@ -160,24 +159,24 @@ impl fmt::Display for StateValue {
     }
 }
 
-/// What can be asked about the health of a field port.
+/// A value of the health of a field port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum PortValue {
-    /// 1 while its device is there and none of its input frames is overdue, else 0.
+    /// 1 while the device is there and none of its input frames is overdue, otherwise 0.
     Alive,
     /// Number of accepted frames, wrapping.
     Frames,
-    /// Age of the newest accepted frame in milliseconds, saturating; the maximum before the first.
+    /// Age of the newest accepted frame in milliseconds, saturating; the maximum before the first frame.
     Age,
     /// Number of rejected frames, wrapping. CAN frames for other nodes do not count.
     Rejected,
-    /// Number of frames with a text that is ignored, such as `NOREAD`, wrapping.
+    /// Number of frames with an ignored text, such as `NOREAD`, wrapping.
     Ignored,
 }
 
 impl PortValue {
-    /// All of them, with their names in files.
+    /// All values, with their names in files.
     pub const NAMES: [(&'static str, Self); 5] = [
         ("alive", Self::Alive),
         ("frames", Self::Frames),
@@ -186,12 +185,12 @@ impl PortValue {
         ("ignored", Self::Ignored),
     ];
 
-    /// The value of this name.
+    /// The value with this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::NAMES.iter().find(|(own, _)| *own == name).map(|&(_, value)| value)
     }
 
-    /// Its name in files.
+    /// The name in files.
     pub fn name(self) -> &'static str {
         match self {
             Self::Alive => "alive",
@@ -202,19 +201,19 @@ impl PortValue {
         }
     }
 
-    /// Whether it is a count, which wraps in its field and takes no scale.
+    /// Whether it is a count, which wraps in its field and has no scale.
     pub const fn is_count(self) -> bool {
         matches!(self, Self::Frames | Self::Rejected | Self::Ignored)
     }
 }
 
-/// A link to the controller, of which an output field shows whether it is up.
+/// A link to the controller whose state an output field shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum LinkSource {
     /// To the command port.
     Command,
-    /// The second connection to it, for commands that stop the robot.
+    /// The second connection to the command port, for commands that stop the robot.
     Urgent,
     /// To the state stream.
     State,
@@ -227,7 +226,7 @@ pub enum LinkSource {
 }
 
 impl LinkSource {
-    /// Those that are no ports, with their names in files and in statistics.
+    /// The links that are not ports, with their names in files and in statistics.
     pub const NAMES: [(&'static str, Self); 5] = [
         ("command", Self::Command),
         ("urgent", Self::Urgent),
@@ -236,18 +235,18 @@ impl LinkSource {
         ("udp2011", Self::RecipeUdp),
     ];
 
-    /// The link of this name; `None` if it can only be that of a port.
+    /// The link with this name; `None` if only a port can have the name.
     pub fn named(name: &str) -> Option<Self> {
         Self::NAMES.iter().find(|(own, _)| *own == name).map(|&(_, link)| link)
     }
 
-    /// Its name in files; `None` of a listening port, which has its own.
+    /// The name in files; `None` for a listening port, which has a name of its own.
     pub fn name(self) -> Option<&'static str> {
         Self::NAMES.iter().find(|(_, link)| *link == self).map(|&(name, _)| name)
     }
 }
 
-/// The variables that tell the robot the health of a port. The port owns them.
+/// The variables that report the health of a port to the robot. The port owns them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct PortHealth {
@@ -267,7 +266,7 @@ impl PortHealth {
     /// No variable.
     pub const NONE: Self = Self { alive: None, frames: None, age: None, rejected: None, ignored: None };
 
-    /// The variables, with what each gets.
+    /// The variables, each with its value.
     pub fn iter(&self) -> impl Iterator<Item = (PortValue, SysVar)> + use<> {
         let Self { alive, frames, age, rejected, ignored } = *self;
         let all = [
@@ -291,7 +290,7 @@ impl PortHealth {
         }
     }
 
-    /// Whether a variable can get such a value: words and floats of the registers.
+    /// Whether a variable can report such a value: words and floats of the registers.
     pub(super) fn can_write(var: SysVar) -> bool {
         matches!(var.group(), "WordInputReg" | "FloatInputReg")
     }

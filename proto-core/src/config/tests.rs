@@ -1,5 +1,5 @@
-//! Mistakes that a file cannot have but a stored or hand-made configuration can, each with its
-//! place. The messages for files are tested with the files.
+//! Errors that a file cannot have, but a stored or hand-made configuration can, each with its place. The messages for
+//! files are tested with the files.
 
 #[cfg(feature = "serde")]
 use proptest::prelude::*;
@@ -152,7 +152,7 @@ fn indices_that_name_nothing_are_refused() {
 
 #[test]
 fn fields_of_the_wrong_kind_are_refused() {
-    // The layout checks the fields of a realtime recipe; only the recipe's check sees bindings.
+    // The layout checks the fields of a realtime recipe; only the check of recipes sees bindings.
     Builder::new().user(&[constant()], &[]).refused(
         field(0, Direction::Input, 0),
         ConfigErrorKind::WrongField { mode: Mode::User, part: Direction::Input },
@@ -225,7 +225,7 @@ fn a_variable_has_one_owner() {
         Place::Port { port: 1, key: PortKey::Recipe },
         ConfigErrorKind::OwnedTwice { var, other: 0 },
     );
-    // A way up carries what a port owns, and owns nothing itself.
+    // A route carries what a port owns, but owns nothing itself.
     Builder::one_port().port(0, Bus::UdpListen { listen: text("0.0.0.0:0") }).valid();
 }
 
@@ -241,7 +241,7 @@ fn what_only_recipe_ports_carry_needs_one() {
         .stream(&["ForceEnd[1]"], &[])
         .link(0)
         .refused(field(0, Direction::Input, 0), ConfigErrorKind::Unowned { var: force });
-    // What the state stream shows can be read back instead.
+    // A variable that the state stream shows can also be read back.
     Builder::new().stream(&["FloatInputReg[1]"], &[]).link(0).valid();
 
     let mass = var("RobotState[26]");
@@ -289,7 +289,7 @@ fn warnings_are_not_errors() {
     assert_eq!(Builder::one_port().valid().view().warnings().count(), 0);
 }
 
-/// Exchanges of all kinds, each in a recipe of its own, and their ports.
+/// Adds all kinds of exchanges, each in its own recipe, and their ports.
 #[cfg(feature = "serde")]
 fn add_exchanges(config: &mut GatewayConfig) {
     let time = Duration::from_millis(50);
@@ -327,7 +327,7 @@ fn add_exchanges(config: &mut GatewayConfig) {
     config.add_port(&Port::can("remote", "remote")).unwrap();
 }
 
-/// Fields of all kinds, exchanges, a command table, a safe value and a board's own address.
+/// All kinds of fields, exchanges, a command table, a safe value and a board's own address.
 #[cfg(feature = "serde")]
 pub(super) fn every_kind() -> GatewayConfig {
     let table = InputBinding::Commands { table: Span { start: 0, len: 1 }, when: CommandWhen::Frame };
@@ -367,7 +367,7 @@ proptest! {
         }
         let Ok(config) = postcard::from_bytes::<GatewayConfig>(&bytes[..len]) else { return Ok(()) };
         match config.validate() {
-            // An engine must be able to plan what passes.
+            // An engine must be able to plan a valid configuration.
             Ok(()) => {
                 prop_assert!(config.view().warnings().count() < 1_000);
                 let view = config.view();
@@ -404,7 +404,7 @@ fn network() -> Network {
     }
 }
 
-/// The result of checking one port, a controller at this address, and a changed network.
+/// Checks one port, a controller with this address, and a changed network.
 fn checked(controller: &str, change: impl FnOnce(&mut Network)) -> Result<(), (NetworkKey, ConfigErrorKind)> {
     let mut config = Builder::one_port().0;
     config.controller.address = text(controller);
@@ -443,7 +443,7 @@ fn a_board_its_router_and_its_name_server_have_addresses_of_hosts() {
         let refused = checked("192.168.12.138", |network| network.prefix = prefix);
         assert_eq!(refused, Err((NetworkKey::Address, ConfigErrorKind::Prefix { prefix })));
     }
-    // The network's own address, its broadcast address, and addresses that no host has.
+    // The network's own address, its broadcast address, and addresses that no host can have.
     let nobody = ["192.168.12.0", "192.168.12.255", "0.0.0.1", "127.0.0.1", "224.0.0.1", "255.255.255.255"];
     for address in nobody.map(|address| address.parse::<Ipv4Addr>().unwrap()) {
         let is_refused = |refused, wanted| {

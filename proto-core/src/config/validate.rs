@@ -1,8 +1,7 @@
 //! The checks that a configuration must pass before the engine takes it.
 //!
-//! In: a configuration, from whatever file format. Out: nothing, or the first mistake with its
-//! place. Order: controller, recipes, ports, then what concerns several of them (owners, ways up
-//! and sources).
+//! In: a configuration from any file format. Out: nothing, or the first error with its place. Order: controller,
+//! recipes, ports, then checks across them (owners, routes and sources).
 
 use super::check_recipe::{RecipeCheck, check_layout};
 use super::error::{
@@ -28,7 +27,7 @@ impl<'c> ConfigView<'c> {
     /// Checks everything that can be checked without the controller.
     ///
     /// # Errors
-    /// The first mistake, with its place and the numbers.
+    /// The first error, with its place and numbers.
     pub fn validate(self) -> Result<(), ConfigError> {
         self.check_counts()?;
         self.check_controller()?;
@@ -45,7 +44,7 @@ impl<'c> ConfigView<'c> {
         self.check_safe_values()
     }
 
-    /// The engine and the image have room for the maximum of a file.
+    /// Engine and image hold at most the maximum of a file.
     fn check_counts(&self) -> Check {
         for (what, needed, room) in [
             (Counted::Ports, self.ports.len(), MAX_PORTS),
@@ -87,7 +86,7 @@ impl<'c> ConfigView<'c> {
         checked.map_err(|(key, kind)| ConfigError { place: Place::Network(key), kind })
     }
 
-    /// The controller's TCP and UDP ports take realtime stream recipes only (D16).
+    /// The controller's TCP and UDP ports support only realtime stream recipes (D16).
     fn check_upstream_recipe(&self, place: Place, index: u8) -> Check {
         let recipe = self.recipe_at(place, index)?;
         if !matches!(recipe.parts, Parts::Stream { .. }) {
@@ -170,7 +169,7 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    /// A recipe for Modbus TCP: that of a Modbus master, without a broadcast.
+    /// A recipe for Modbus TCP must be a Modbus master's, without broadcasts.
     fn check_master(&self, place: Place, index: u8, recipe: &Recipe) -> Check {
         let exchanges = self.exchanges_of(recipe);
         if exchanges.is_empty()
@@ -185,10 +184,10 @@ impl<'c> ConfigView<'c> {
         })
     }
 
-    /// A byte stream needs a head or a tail to find frames by (D18); everything else is valid on
-    /// any line and was checked with the recipe.
+    /// A byte stream needs a head or a tail to find its frames (D18); everything else is valid on any line and was
+    /// checked with the recipe.
     fn check_framing(&self, port: u8, index: u8, recipe: &Recipe) -> Check {
-        // A device's frames are laid out when the recipe is checked, the same for every line.
+        // The layout of a device's frames is checked with the recipe, for any line.
         if self.is_device(recipe) {
             return Ok(());
         }
@@ -222,7 +221,7 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// Each variable has one owner, or its bits have.
+    /// Each variable, or each of its bits, has one owner.
     fn check_owners(&self) -> Check {
         let mut owners = [None; INPUT_COUNT];
         let has_bits = self.fields.iter().any(|field| field.bit().is_some());
@@ -231,7 +230,7 @@ impl<'c> ConfigView<'c> {
                 self.check_bit_owners(index, recipe)?;
             }
             for var in self.written_by(recipe) {
-                // An input variable's ordinal is below INPUT_COUNT; others are refused earlier.
+                // An input variable's ordinal is below INPUT_COUNT; others have already been refused.
                 let Some(owner) = owners.get_mut(var.ordinal()) else { continue };
                 match *owner {
                     Some(other) if other != index => {
@@ -253,8 +252,8 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    /// No earlier port writes a bit that the port writes, or its variable, or a bit of a variable that
-    /// the port writes.
+    /// Checks that no earlier port writes the same bit, the variable of a bit, or a bit of a variable that the port
+    /// writes.
     fn check_bit_owners(&self, index: u8, recipe: &Recipe) -> Check {
         let place = Place::Port { port: index, key: PortKey::Recipe };
         for (other, _, earlier) in self.field_ports().take_while(|(other, ..)| *other < index) {
@@ -275,8 +274,7 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    /// Every variable that a port writes can be carried, and everything that is carried has a
-    /// value.
+    /// Checks that every variable that a port writes has a route, and that every variable on a route has a value.
     fn check_routes(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             for (frame, field, spec) in self.fields_of(recipe, Direction::Input) {
@@ -307,11 +305,11 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    /// Every variable that a port sends or triggers on has a source.
+    /// Checks that every variable that a port sends or triggers on has a source.
     fn check_sources(&self) -> Check {
         for (port, port_config, recipe) in self.field_ports() {
             let index = port_config.recipe;
-            // An input variable can be shown as its owner sent it last.
+            // An input variable can be shown as last sent by its owner.
             let is_shown = |var: SysVar| {
                 var.stream().is_some()
                     || var.modbus().is_some()
@@ -334,7 +332,7 @@ impl<'c> ConfigView<'c> {
         Ok(())
     }
 
-    /// Whether a way up carries `var` in its input part, or shows it in its output part.
+    /// Whether a route carries `var` in its input part, or shows it in its output part.
     fn carried(&self, part: Direction, var: SysVar) -> bool {
         self.upstream_recipes().any(|(_, recipe)| self.carries(recipe, part, var))
     }

@@ -1,15 +1,14 @@
 //! A borrowed view of a configuration of any size.
 //!
-//! In: a [`GatewayConfig`](super::GatewayConfig) of any parameters, or slices of a program's own. Out:
-//! borrowed slices, and the questions that concern several of them.
+//! In: a [`GatewayConfig`](super::GatewayConfig) of any size, or slices of a program's own. Out: borrowed slices, and
+//! queries across them.
 
 use heapless::VecView;
 
 use super::network::Network;
 use super::{CommandEntry, ControllerLink, Exchange, FieldSpec, FrameSpec, Port, Recipe, SafeValue};
 
-/// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the
-/// fields.
+/// A configuration of any size, borrowed; [`GatewayConfig`](super::GatewayConfig) describes the fields.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub struct ConfigView<'c> {
@@ -25,7 +24,7 @@ pub struct ConfigView<'c> {
     pub fields: &'c [FieldSpec],
     /// The entries of all command tables; bindings refer to ranges of it.
     pub commands: &'c [CommandEntry],
-    /// The values that inputs take when their port times out; ports refer to ranges of it.
+    /// The values that inputs take if their port times out; ports refer to ranges of it.
     pub safe_values: &'c [SafeValue],
     /// The exchanges of all recipes; recipes refer to ranges of it.
     pub exchanges: &'c [Exchange],
@@ -34,8 +33,7 @@ pub struct ConfigView<'c> {
 }
 
 impl<'c> ConfigView<'c> {
-    /// A view with a controller and nothing else; a program that keeps its own slices sets the
-    /// other fields.
+    /// A view with only a controller; a program with slices of its own sets the other fields.
     pub const fn new(controller: &'c ControllerLink) -> Self {
         Self {
             controller,
@@ -50,7 +48,7 @@ impl<'c> ConfigView<'c> {
         }
     }
 
-    /// The recipes on the ways up: that of the recipe link, then those of the listening ports.
+    /// The recipes on the routes to the controller: that of the recipe link, then those of the listening ports.
     pub(crate) fn upstream_recipes(self) -> impl Iterator<Item = (u8, &'c Recipe)> {
         let link = self.controller.recipe_link.map(|link| link.recipe);
         let ports = self.ports.iter().filter(|port| !port.bus.is_field()).map(|port| port.recipe);

@@ -1,7 +1,7 @@
-//! Walks over the frames of a recipe, their fields and their variables, and what a walk answers.
+//! Iterators over the frames of a recipe, their fields and their variables, and queries that use them.
 //!
-//! They are written out: the checks, the plan and the engine walk many times when they start, and a
-//! chain of adapters asks each of its parts at every step, also those that only devices have.
+//! They are written by hand: the checks, the plan and the engine iterate many times at the start, and a chain of
+//! adapters would check each of its parts in every step, even those that only devices have.
 
 use core::slice::Iter;
 
@@ -10,14 +10,14 @@ use super::recipe::{PartFrames, Variables};
 use super::{ConfigView, Exchange, FieldSpec, FrameSpec, OutputBinding, Port, Recipe, Span};
 use crate::sysvar::{Direction, SysVar, VarBit};
 
-/// The same and those of the frames of exchanges behind them, counted.
+/// Iterates over the frames of a part and those of the exchanges after them, with their numbers.
 #[derive(Debug, Clone)]
 pub(crate) struct Frames<'c> {
     parts: PartFrames<'c>,
     exchanges: Iter<'c, Exchange>,
-    /// The exchange that the newest frame is of, and whether the frame is its reply; `None` if it is of a part.
+    /// The exchange of the newest frame, and whether the frame is its reply; `None` for a frame of a part.
     of: Option<(&'c Exchange, bool)>,
-    /// What is left of that exchange: its pending answer and its refusal.
+    /// The remaining frames of that exchange: its pending answer and its refusal.
     others: [Option<Span>; 2],
     frames: &'c [FrameSpec],
     pool: &'c [FieldSpec],
@@ -37,7 +37,7 @@ impl Iterator for Frames<'_> {
 }
 
 impl<'c> Frames<'c> {
-    /// The exchange that the newest frame is of, and whether the frame is its reply; `None` if it is of a part.
+    /// The exchange of the newest frame, and whether the frame is its reply; `None` for a frame of a part.
     pub(crate) fn exchange(&self) -> Option<(&'c Exchange, bool)> {
         self.of
     }
@@ -59,12 +59,12 @@ impl<'c> Frames<'c> {
     }
 }
 
-/// The fields of these frames, each with the frame's number and its own.
+/// Iterates over the fields of the frames, each with the frame's number and its own index.
 #[derive(Debug, Clone)]
 pub(super) struct FrameFieldIter<'c> {
     frames: Frames<'c>,
     pool: &'c [FieldSpec],
-    /// What is left of a frame.
+    /// The remaining fields of the frame.
     fields: Iter<'c, FieldSpec>,
     frame: u8,
     count: u8,
@@ -86,11 +86,11 @@ impl<'c> Iterator for FrameFieldIter<'c> {
     }
 }
 
-/// The variables of these fields.
+/// Iterates over the variables of the fields.
 #[derive(Debug, Clone)]
 pub(super) struct FrameVariables<'c> {
     fields: FrameFieldIter<'c>,
-    /// What is left of a field.
+    /// The remaining variables of the field.
     variables: Variables,
 }
 
@@ -114,8 +114,8 @@ impl<'c> ConfigView<'c> {
         recipe.exchanges.of(self.exchanges)
     }
 
-    /// The ranges of the fields of one part of `recipe`, with the frame's number: 0 in a stream, else
-    /// that of the CAN frame, and behind these the frames of the exchanges, counted on.
+    /// The ranges of the fields of one part of `recipe`, with the frame's number: 0 in a stream, otherwise the index of
+    /// the CAN frame. The frames of the exchanges follow, counted after those of the part.
     pub(crate) fn frames_of(self, recipe: &'c Recipe, part: Direction) -> Frames<'c> {
         let exchanges = self.exchanges_of(recipe).iter();
         let (frames, pool) = (self.frames, self.fields);
@@ -123,13 +123,13 @@ impl<'c> ConfigView<'c> {
         Frames { parts: recipe.part_frames(part), exchanges, of, others, frames, pool, part, count: 0 }
     }
 
-    /// Whether frames come from the device (input), or go to it (output).
+    /// Whether frames are received (input) or sent (output).
     pub(crate) fn has_frames(self, recipe: &'c Recipe, part: Direction) -> bool {
         self.frames_of(recipe, part).next().is_some()
     }
 
-    /// The fields of one part of `recipe`, with the number of the frame (see
-    /// `frames_of`) and the index of the field in it.
+    /// The fields of one part of `recipe`, with the number of the frame (see `frames_of`) and the index of the field in
+    /// it.
     pub fn fields_of(
         self,
         recipe: &'c Recipe,
@@ -155,14 +155,13 @@ impl<'c> ConfigView<'c> {
         frames.any(|(_, span)| span.of(self.fields).iter().any(|field| field.is_bound_to(var)))
     }
 
-    /// The input variables that a field port owns: those that its frames write, and those of its
-    /// health.
+    /// The input variables that a field port owns: those that its frames write, and those for its health.
     pub fn owned_by(self, port: &'c Port, recipe: &'c Recipe) -> impl Iterator<Item = SysVar> + 'c {
         self.written_by(recipe).chain(self.status_variables(0, port, recipe).map(|(_, var)| var))
     }
 
-    /// The input variables that tell the robot something about the port with this index: its health, and what became of
-    /// events. Each with its place.
+    /// The input variables that report something about the port with this index to the robot: its health, and the
+    /// outcome of events. Each with its place.
     pub(crate) fn status_variables(
         self,
         index: u8,
@@ -184,7 +183,7 @@ impl<'c> ConfigView<'c> {
             .any(|(_, _, recipe)| self.fields_of(recipe, Direction::Output).any(|(_, _, field)| shows(field)))
     }
 
-    /// The bits that a field port writes one by one.
+    /// The bits that a field port writes individually.
     pub fn bits_written_by(self, recipe: &'c Recipe) -> impl Iterator<Item = VarBit> + 'c {
         self.fields_of(recipe, Direction::Input).filter_map(|(_, _, field)| field.bit())
     }
