@@ -248,16 +248,16 @@ impl<'a> InputField<'a> {
         Self { on_wire: OnWire::value(encoding), does: Does::WritesBit { name } }
     }
 
-    /// A field whose value selects a command of port 2000 when it changes: pairs of value and command, such as `(1,
-    /// "run(pick.jspf,50)")`. Integer types only.
+    /// A field whose value selects a command of port 2000 when it changes. The entries are pairs of value and command,
+    /// such as `(1, "run(pick.jspf,50)")`. Integer types only.
     pub fn commands(encoding: impl Into<Encoding>, entries: &'a [(i64, &'a str)]) -> Self {
         let does =
             Does::Commands { entries: Entries::Values(entries), when: CommandWhen::Change, idle: None };
         Self { on_wire: OnWire::value(encoding), does }
     }
 
-    /// Like [`Self::commands`], with ranges of values: first value, last value and command, such as `(1, 100,
-    /// "speed({value})")`. `{value}` is replaced by the field's value.
+    /// Like [`Self::commands`], with ranges of values. The entries are first value, last value and command, such as
+    /// `(1, 100, "speed({value})")`; `{value}` is replaced by the field's value.
     pub fn command_ranges(encoding: impl Into<Encoding>, entries: &'a [(i64, i64, &'a str)]) -> Self {
         let does =
             Does::Commands { entries: Entries::Ranges(entries), when: CommandWhen::Change, idle: None };
@@ -428,8 +428,8 @@ impl<'a> OutputField<'a> {
         Self { allowed: Allowed::Inside(Limits { low, high, outside: Outside::Clamp }), ..self }
     }
 
-    /// Sends numbers of a table: first and last value of the source, and the number sent for them, such as `(1, 4,
-    /// 0.0)`. For other values the frame is not sent. Makes the field a device's; it has no scale and offset.
+    /// Sends numbers of a table. The entries are first and last value of the source, and the number sent for them, such
+    /// as `(1, 4, 0.0)`. For other values the frame is not sent. Makes the field a device's; it has no scale and offset.
     pub fn mapped(self, entries: &'a [(i64, i64, f64)]) -> Self {
         Self { allowed: Allowed::Mapped(entries), ..self }
     }

@@ -1,8 +1,8 @@
 //! Limits of a field's number, tables of numbers, and rules of input fields.
 //!
-//! They follow their field as separate entries, so that fields without them take no space for them. They have no bytes
-//! in the frame. If an output field's number is not allowed, the frame is not sent, except that [`Outside::Clamp`]
-//! sends another number. Input fields can have them if they write a variable as a whole. Nothing here is checked;
+//! These entries follow their field in the list of fields, so fields without them need no extra space. They have no
+//! bytes in the frame. If an output field's number is not allowed, the frame is not sent; only [`Outside::Clamp`] sends
+//! another number. Input fields can have entries if they write a variable as a whole. Nothing here is checked;
 //! `check_limits.rs` does that.
 
 use crate::device::Encoding;

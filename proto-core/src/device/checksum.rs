@@ -19,7 +19,7 @@ pub struct Crc {
     pub poly: u32,
     /// The register before the first byte, not reflected.
     pub init: u32,
-    /// XORed with the result.
+    /// Combined with the result by exclusive or.
     pub xorout: u32,
     /// Bytes are taken lowest bit first.
     pub refin: bool,

@@ -343,7 +343,7 @@ impl Encoding {
     }
 
     /// Writes `value`, which [`Self::fit`] returned, to the front of `out` and returns the number of bytes; the caller
-    /// writes a terminating byte. Bits are ORed with those in `out`. `None`, with nothing written, if `out` is too
+    /// writes a terminating byte. Bits are added to those in `out`. `None`, with nothing written, if `out` is too
     /// short.
     pub fn write(&self, value: f64, out: &mut [u8]) -> Option<usize> {
         let len = self.size().unwrap_or(0);

@@ -29,10 +29,10 @@ pub const MAX_SLAVES: usize = 32;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum Echo {
-    /// It does not.
+    /// It hears only others.
     #[default]
     Absent,
-    /// It hears each byte that is sent, as with a 2-wire adapter whose receiver is always on. A reply is searched only
+    /// It hears each byte that is sent, as with a 2-wire adapter whose receiver is always on. A reply is expected only
     /// after the echo of its request, because replies of FC 5 and 6 look like their requests.
     Heard,
 }

@@ -20,7 +20,7 @@ impl Timing {
     pub const FAST_T1_5: Duration = Duration::from_micros(750);
     /// Replaces 3.5 characters above [`Self::FAST`].
     pub const FAST_T3_5: Duration = Duration::from_micros(1_750);
-    /// Default time for the slaves after a broadcast; the standard has 100 to 200 ms.
+    /// The turnaround that [`Self::new`] sets; the standard has 100 to 200 ms.
     pub const TURNAROUND: Duration = Duration::from_millis(100);
 
     /// Timing of a line with `baud` bit/s and `bits` bits per character: start, data, parity and stop bits, 11 in the
