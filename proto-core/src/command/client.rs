@@ -43,7 +43,6 @@ pub struct CommandClient {
     dropped: u32,
 }
 
-/// A request in flight.
 #[derive(Debug, Clone, Copy)]
 struct PendingRequest {
     keyword: Keyword,

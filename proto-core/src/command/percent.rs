@@ -110,7 +110,6 @@ impl Decimal {
         Self { digits: u64::try_from(digits).unwrap_or(u64::MAX), decimals, more: false }
     }
 
-    /// The nearest binary32.
     fn nearest(self) -> Option<f32> {
         let digits = u128::from(self.digits);
         let divisor = 10_u128.saturating_pow(self.decimals);
@@ -125,7 +124,6 @@ impl Decimal {
         Some((quotient | u128::from(inexact)) as f32 * unit)
     }
 
-    /// The characters of the number.
     fn bytes(self) -> impl Iterator<Item = u8> {
         let length = self.digits.checked_ilog10().unwrap_or(0);
         (0..=length.max(self.decimals)).rev().flat_map(move |place| {

@@ -38,7 +38,6 @@ impl Table {
 }
 
 impl<'c> ConfigView<'c> {
-    /// All warnings about typical mistakes.
     pub(super) fn advice(self) -> impl Iterator<Item = Warning> + 'c {
         let commands = self.stops_on_edges().chain(self.forgotten_bases());
         let times = self.short_timeouts().chain(self.slow_replies()).chain(self.lost_peers());

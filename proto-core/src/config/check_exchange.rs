@@ -18,7 +18,6 @@ use crate::time::Duration;
 
 /// Maximum pause after an exchange.
 pub const MAX_PAUSE: Duration = Duration::from_secs(10);
-/// The exchanges of one recipe under check.
 pub(super) struct ExchangeCheck<'a> {
     pub config: ConfigView<'a>,
     pub index: u8,

@@ -18,7 +18,6 @@ use crate::sysvar::{COUNT, Direction, SysVar, VarBit};
 use crate::wire::dialect::Dialect;
 use crate::wire::scalar::{Scalar, ScalarType};
 
-/// A recipe to check.
 pub(super) struct RecipeCheck<'a> {
     config: ConfigView<'a>,
     index: u8,

@@ -299,7 +299,6 @@ impl fmt::Display for DescribedKind<'_> {
 }
 
 impl ConfigErrorKind {
-    /// Errors in a variable or bit.
     fn fmt_variable(self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         use ConfigErrorKind as Kind;
         match self {
@@ -360,7 +359,6 @@ impl ConfigErrorKind {
         }
     }
 
-    /// Errors in a number or text.
     fn fmt_value(self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         use ConfigErrorKind as Kind;
         match self {

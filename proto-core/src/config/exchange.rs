@@ -34,8 +34,8 @@ pub struct Exchange {
     /// How long after an event its request may still be sent. `None` is the timeout of the port, at most
     /// [`MAX_TRIGGER`].
     pub trigger: Option<Duration>,
-    /// How long after its request a late reply may arrive, which comes after [`Self::timeout`]. Until then, requests to
-    /// the peer with replies that could be confused with it wait. `None` is three times the timeout, at least
+    /// How long after its request a late reply (after [`Self::timeout`]) may still arrive. Until then, requests to the
+    /// peer wait if their replies could be confused with it. `None` is three times the timeout, at least
     /// [`DEFAULT_LATE`].
     pub late: Option<Duration>,
     /// The exchange stops its peer: it is sent first, cancels the peer's events, and is repeated until confirmed.
@@ -43,7 +43,7 @@ pub struct Exchange {
     /// The exchange of the recipe, counted from 0, after whose good reply this one is sent.
     pub follow: Option<u8>,
     /// When the values of the reply are overdue. `None` is the timeout of the port; [`Port::NEVER`](super::Port::NEVER)
-    /// is for a reply that is sent only on events.
+    /// is never, for a reply that is sent only on events.
     pub overdue: Option<Duration>,
     /// The variables that report the outcome of the exchange's events to the robot.
     pub outcome: OutcomeTo,
@@ -58,7 +58,7 @@ pub struct Exchange {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Restarted {
-    /// The reply's field with the number, counted from 0 without padding and texts.
+    /// The reply's field with the number, counted from 0: values and constants count, padding and texts do not.
     pub field: u8,
     /// The number, before scale and offset.
     pub value: f64,

@@ -323,7 +323,7 @@ impl<'a> ExchangeBuilder<'a> {
     }
 
     /// Sets how long after its request a late reply may arrive; by default three timeouts, at least 1 s. Until then,
-    /// requests to the device with replies that could be confused with it wait.
+    /// requests to the device wait if their replies could be confused with it.
     pub const fn late(mut self, late: Duration) -> Self {
         self.exchange.late = Some(late);
         self
@@ -379,7 +379,6 @@ impl<'a> ExchangeBuilder<'a> {
         self.all_frames().any(|frame| frame.id.is_some())
     }
 
-    /// The device's own frames.
     pub(super) fn all_frames(&self) -> impl Iterator<Item = &ExchangeFrame<'a>> {
         let frames = match &self.transaction {
             TransactionDraft::Frames(frames) => &frames[..],
@@ -388,7 +387,6 @@ impl<'a> ExchangeBuilder<'a> {
         frames.iter().chain([&self.pending]).flatten()
     }
 
-    /// All lists of fields.
     pub(super) fn fields(&self) -> impl Iterator<Item = Fields<'a>> {
         let own = match self.transaction {
             TransactionDraft::Rtu { written, read, .. } => [written, read],

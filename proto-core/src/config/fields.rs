@@ -211,7 +211,6 @@ pub(super) enum Does<'a> {
     Counter { max: u32 },
 }
 
-/// The entries of a command table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Entries<'a> {
     Values(&'a [(i64, &'a str)]),

@@ -188,7 +188,6 @@ pub(super) fn check_pool(place: Place, span: Span, len: usize) -> Check {
     if end <= len { Ok(()) } else { fail(place, Kind::OutsidePool { end, len }) }
 }
 
-/// Copies a text of at most `N` bytes.
 pub(super) fn text<const N: usize>(given: &str) -> Result<String<N>, Kind> {
     String::try_from(given).map_err(|_| Kind::TooLong { len: given.len(), longest: N })
 }

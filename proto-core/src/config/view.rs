@@ -67,30 +67,20 @@ impl<'c> ConfigView<'c> {
 /// A mutable borrow of a configuration of any size; [`GatewayConfig`](super::GatewayConfig) describes the fields.
 #[derive(Debug)]
 pub(crate) struct ConfigMut<'c> {
-    /// The controller's address, ports and dialect.
     pub(crate) controller: &'c mut ControllerLink,
-    /// The board's own address.
     #[cfg(feature = "image")]
     pub(crate) network: &'c mut super::BoardAddress,
-    /// Every recipe.
     pub(crate) recipes: &'c mut VecView<Recipe>,
-    /// Every port.
     pub(crate) ports: &'c mut VecView<Port>,
-    /// The fields of all recipes.
     pub(crate) fields: &'c mut VecView<FieldSpec>,
-    /// The entries of all command tables.
     pub(crate) commands: &'c mut VecView<CommandEntry>,
-    /// The safe values of all ports.
     pub(crate) safe_values: &'c mut VecView<SafeValue>,
-    /// The exchanges of all recipes.
     pub(crate) exchanges: &'c mut VecView<Exchange>,
-    /// The frames of exchanges.
     pub(crate) frames: &'c mut VecView<FrameSpec>,
 }
 
 #[cfg(feature = "image")]
 impl ConfigMut<'_> {
-    /// A read-only view of the configuration.
     pub(crate) fn view(&self) -> ConfigView<'_> {
         ConfigView {
             controller: self.controller,

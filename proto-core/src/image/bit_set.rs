@@ -10,7 +10,6 @@ const _: () = assert!(BIT_INPUT_COUNT * 8 <= 128);
 pub(crate) struct BitSet(u128);
 
 impl BitSet {
-    /// The empty set.
     pub(crate) const EMPTY: Self = Self(0);
 
     /// The bits of one variable.
@@ -37,13 +36,11 @@ impl BitSet {
         self.minus(Self::of(var, mask)).or(Self::of(var, mask & value))
     }
 
-    /// The intersection.
     #[must_use]
     pub(crate) const fn and(self, other: Self) -> Self {
         Self(self.0 & other.0)
     }
 
-    /// The union.
     #[must_use]
     pub(crate) const fn or(self, other: Self) -> Self {
         Self(self.0 | other.0)

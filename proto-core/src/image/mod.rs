@@ -120,26 +120,22 @@ impl Image {
         }
     }
 
-    /// Assigns the variable to the group in which it arrives.
     pub(crate) fn assign(&mut self, var: SysVar, group: GroupId) {
         if let Some(slot) = self.group.get_mut(var.ordinal()) {
             *slot = group.0.saturating_add(1);
         }
     }
 
-    /// The group in which the variable arrives.
     pub(crate) fn group(&self, var: SysVar) -> Option<GroupId> {
         self.group.get(var.ordinal()).and_then(|slot| slot.checked_sub(1)).map(GroupId)
     }
 
-    /// Records that the group has just arrived.
     pub(crate) fn stamp(&mut self, group: GroupId, now: Instant) {
         if let Some(stamp) = self.stamps.get_mut(usize::from(group.0)) {
             *stamp = Stamp::at(now);
         }
     }
 
-    /// When the group last arrived.
     pub(crate) fn stamp_of(&self, group: GroupId) -> Option<Instant> {
         self.stamps.get(usize::from(group.0)).filter(|&&at| at != Stamp::NEVER).map(|at| at.get())
     }

@@ -18,7 +18,6 @@ impl PartialEq for InputSet {
 }
 
 impl InputSet {
-    /// The empty set.
     pub(crate) const EMPTY: Self = Self([0; WORDS]);
 
     /// The byte variables, which come first in the table of inputs.
@@ -31,14 +30,12 @@ impl InputSet {
         }
     }
 
-    /// Removes a variable.
     pub(crate) fn remove(&mut self, var: SysVar) {
         if let Some((word, bit)) = self.slot(var) {
             *word &= !bit;
         }
     }
 
-    /// Whether the variable is in the set.
     pub(crate) fn contains(&self, var: SysVar) -> bool {
         let ordinal = var.ordinal();
         ordinal < INPUT_COUNT && self.0.get(ordinal / 32).is_some_and(|word| word >> (ordinal % 32) & 1 == 1)
@@ -49,20 +46,17 @@ impl InputSet {
         a | b | c == 0
     }
 
-    /// Number of variables in the set.
     #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         self.0.iter().fold(0, |sum, word| sum.saturating_add(word.count_ones() as usize))
     }
 
-    /// The intersection.
     #[must_use]
     pub(crate) fn and(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
         Self([a & d, b & e, c & f])
     }
 
-    /// The union.
     #[must_use]
     pub(crate) fn or(&self, other: &Self) -> Self {
         let ([a, b, c], [d, e, f]) = (self.0, other.0);
@@ -134,7 +128,6 @@ impl InputSet {
         }
     }
 
-    /// The first variable in table order.
     pub(crate) fn first(&self) -> Option<SysVar> {
         let (nth, word) = match self.0 {
             [0, 0, word] => (64_usize, word),
@@ -178,24 +171,20 @@ impl InputSet {
 pub(crate) struct VarSet([u32; COUNT.div_ceil(32)]);
 
 impl VarSet {
-    /// The empty set.
     pub(crate) const EMPTY: Self = Self([0; COUNT.div_ceil(32)]);
 
-    /// Adds a variable.
     pub(crate) fn insert(&mut self, var: SysVar) {
         if let Some(word) = self.0.get_mut(var.ordinal() / 32) {
             *word |= bit_of(var);
         }
     }
 
-    /// Removes a variable.
     pub(crate) fn remove(&mut self, var: SysVar) {
         if let Some(word) = self.0.get_mut(var.ordinal() / 32) {
             *word &= !bit_of(var);
         }
     }
 
-    /// Whether the variable is in the set.
     pub(crate) fn contains(&self, var: SysVar) -> bool {
         self.0.get(var.ordinal() / 32).is_some_and(|word| word & bit_of(var) != 0)
     }
@@ -223,7 +212,6 @@ pub(crate) struct ExtraSet(u32);
 const _: () = assert!(super::MAX_EXTRA <= 32);
 
 impl ExtraSet {
-    /// The empty set.
     pub(crate) const EMPTY: Self = Self(0);
 
     /// Adds or removes a value.

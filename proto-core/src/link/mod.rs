@@ -126,12 +126,10 @@ impl Supervisor {
         }
     }
 
-    /// The state of the link.
     pub(crate) const fn state(&self) -> LinkState {
         self.state
     }
 
-    /// Whether the link is usable.
     pub(crate) const fn is_up(&self) -> bool {
         matches!(self.state, LinkState::Up { .. })
     }
@@ -170,7 +168,6 @@ impl Supervisor {
         self.action == Some(LinkAction::Open)
     }
 
-    /// Bytes arrived.
     pub(crate) fn heard(&mut self, now: Instant) {
         self.heard = now;
     }

@@ -233,7 +233,6 @@ fn turn_piece<const N: usize>(registers: &[[u8; 2]; N], words: &mut [u16; N]) {
 const HALF: usize = 8;
 const PIECE: usize = 16;
 
-/// Bytes that `count` packed coils take.
 pub(super) const fn packed_len(count: u16) -> usize {
     count.div_ceil(8) as usize
 }

@@ -76,7 +76,6 @@ impl RunContent {
     const PLAIN: Self = Self(0xFF);
 }
 
-/// The fields of one frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameFields<'a> {
     fields: &'a [Field],
@@ -311,7 +310,6 @@ impl FieldRun {
         }
     }
 
-    /// Whether the values are valid.
     fn accepts(&self, run: &[u8]) -> bool {
         self.kind != RunContent::FLOATS || runs::all_finite(run)
     }
@@ -335,7 +333,6 @@ impl FieldRun {
         }
     }
 
-    /// Reads a run from the image.
     fn read(&self, image: &[u8; IMAGE_BYTES], run: &mut [u8]) {
         if let Some(source) = image.get(self.range()) {
             runs::copy(run, source);

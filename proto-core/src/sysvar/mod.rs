@@ -66,7 +66,6 @@ pub enum ModbusPlace {
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct SysVar(u8);
 
-/// The places of a variable.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct VarPlace {
     /// In the Modbus map.

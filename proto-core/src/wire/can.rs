@@ -146,7 +146,6 @@ impl CanFrame {
         self.key.id()
     }
 
-    /// The frame's id in one word.
     pub(crate) const fn key(&self) -> CanKey {
         self.key
     }

@@ -138,7 +138,6 @@ impl Slave {
         self.kept > 0
     }
 
-    /// Takes a kept reply.
     pub(crate) fn take_kept(&mut self, out: &mut [u8]) -> Option<usize> {
         let kept = self.buffer.iter().take(core::mem::take(&mut self.kept));
         let len = out.iter_mut().zip(kept).map(|(slot, &byte)| *slot = byte).count();

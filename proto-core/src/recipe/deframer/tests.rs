@@ -49,7 +49,6 @@ fn sensor_frame(number: u8) -> Vec<u8> {
     frame
 }
 
-/// The payload of [`sensor_frame`].
 fn sensor_payload(number: u8) -> Vec<u8> {
     sensor_frame(number)[2..26].to_vec()
 }
