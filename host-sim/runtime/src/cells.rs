@@ -23,13 +23,13 @@ use crate::{RunError, RunOptions};
 /// A cell of a process that serves several.
 #[derive(Debug)]
 pub struct Cell {
-    /// What `ready`, the statistics and the log call it; different from all others.
+    /// The unique name of the cell in `ready`, the statistics and the log.
     pub name: String,
     /// The gateway's configuration.
     pub config: Box<GatewayConfig>,
-    /// The file it comes from, which a console needs.
+    /// The file that the configuration was read from, which a console needs.
     pub file: ConfigFile,
-    /// Options of this gateway alone: devices, console. Those of the foreground have no effect.
+    /// Options of this gateway alone: devices, console. Options of the foreground have no effect.
     pub options: RunOptions,
 }
 
@@ -37,7 +37,7 @@ pub struct Cell {
 /// listening; if one ends by itself, all end.
 ///
 /// # Errors
-/// The reason why one of them could not start, with its name; nothing is left behind then.
+/// The name of a cell that could not start, and the reason. Everything that was opened is closed.
 pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Result<(), RunError> {
     raise_file_limit();
     let workers: Vec<_> =
@@ -55,17 +55,17 @@ pub fn run(cells: Vec<Cell>, threads: NonZeroUsize, options: &RunOptions) -> Res
     }
     // The cells keep their workers alive.
     drop(workers);
-    // Everything listens.
+    // All cells listen now.
     let _ = begins.send(true);
     host::foreground(Box::new(Cells::new(started)), options)
 }
 
-/// The usual cycle. Cells start staggered within it, so that they do not contend in each cycle.
+/// The usual cycle, over which the starts of the cells are spread so that they do not contend in each cycle.
 const CYCLE: Duration = Duration::from_millis(4);
 
 fn start(cell: Cell, place: RuntimePlace) -> Result<Box<dyn ForegroundRun>, RunError> {
     let Cell { config, file, options, .. } = cell;
-    // For threads that are started here.
+    // The span for threads that are started here.
     let _of = place.span.clone().entered();
     if let Some(console) = &options.console {
         return Ok(Box::new(Supervised::start(file, &options, console, None, place)?));

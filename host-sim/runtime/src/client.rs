@@ -42,7 +42,7 @@ impl RuntimeClient {
 #[derive(Debug)]
 pub(super) enum RuntimeRequest {
     Stats(blocking::Sender<Value>),
-    /// Whether the thread works.
+    /// Answered if the thread works.
     Ping(oneshot::Sender<()>),
     Shutdown,
 }

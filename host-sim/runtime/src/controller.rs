@@ -46,7 +46,7 @@ use stepping::WaitingClient;
 /// Options of a controller's run beside its file.
 #[derive(Debug, Clone, Default)]
 pub struct ControllerOptions {
-    /// Those of any run.
+    /// Options of any run.
     pub run: RunOptions,
     /// How its clock runs.
     pub pace: Pace,
@@ -78,16 +78,16 @@ pub fn start(config: SimConfig, binds: Vec<Bind>) -> Result<Handle, RunError> {
     )
 }
 
-/// Same, with options. Those for a run in the foreground have no effect.
+/// As [`start`], with options. Options for a run in the foreground have no effect.
 pub fn start_with(config: SimConfig, options: ControllerOptions) -> Result<Handle, RunError> {
     host::start(&RuntimePlace::alone(), "controller", async move |_| {
         let scheduling = match options.pace {
-            // It would look for input with priority over the clients that it waits for.
+            // With real-time priority, it would poll before the clients that it waits for.
             Pace::Stepped => Scheduling::Ordinary,
             Pace::Real | Pace::Factor(_) => options.run.scheduling,
         };
         let running = RunningController::open(config, options).await?;
-        // Not as an argument of the log, which is not evaluated unless it is printed.
+        // Not inside `info!`, which evaluates its arguments only if the line is printed.
         let scheduling = realtime::apply(scheduling);
         info!(%scheduling, "the simulated controller is running");
         Ok(running)
@@ -147,7 +147,7 @@ struct ControllerRuntime {
     moved: Notify,
     /// The ports that are CAN interfaces of the kernel.
     kernel_can: Vec<usize>,
-    /// Since when frames wait at CAN interfaces of the kernel, by the port's number.
+    /// Since when frames wait at CAN interfaces of the kernel, by port number.
     kernel_sends: RefCell<BTreeMap<usize, Instant>>,
     activity: Cell<u64>,
     timeline: RefCell<Option<Timeline>>,
@@ -167,7 +167,7 @@ struct ControllerRuntime {
 struct ServerClient {
     link: Link,
     connection: Rc<Connection>,
-    /// Whether it gets state packets: a client of port 2001 that the controller has accepted.
+    /// Whether it is an accepted client of port 2001, which gets state packets.
     subscribed: bool,
 }
 

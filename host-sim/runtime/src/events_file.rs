@@ -1,8 +1,7 @@
 //! `--events FILE`: every event of the controller as a line of JSON.
 //!
-//! A thread of its own writes, because a slow disk must not delay the controller. Lines beyond
-//! [`MAX_WAITING`] are lost, and the next one that is not says how many. An existing file is replaced only if
-//! it is an events file.
+//! A thread of its own writes, because a slow disk must not delay the controller. Lines beyond [`MAX_WAITING`] are
+//! lost; the next written line says how many. An existing file is replaced only if it is an events file.
 
 use std::cell::Cell;
 use std::fs::{self, File};
@@ -53,7 +52,7 @@ impl EventsFile {
         }
     }
 
-    /// Whether the file that is there is empty or begins with an event.
+    /// Whether the existing file is empty or begins with an event.
     fn begins_with_event(&self) -> io::Result<bool> {
         let mut first = Vec::new();
         BufReader::new(File::open(&self.path)?.take(MAX_LINE)).read_until(b'\n', &mut first)?;
@@ -70,7 +69,7 @@ impl EventsFile {
         let thread = std::thread::Builder::new().name("events".to_owned()).spawn(move || {
             let mut is_failing = false;
             for first in &inbox {
-                // What waits is written at once.
+                // All waiting lines are written at once.
                 let mut text = first;
                 for more in inbox.try_iter() {
                     text.push_str(&more);
@@ -93,7 +92,7 @@ impl EventsFile {
     }
 }
 
-/// Writes events. When it is dropped, everything that waits is written first.
+/// Writes events. Dropping it writes everything that waits.
 #[derive(Debug)]
 pub(super) struct EventsWriter {
     lines: Option<SyncSender<String>>,
@@ -124,7 +123,7 @@ impl Drop for EventsWriter {
 
 /// Maximum number of lines that wait for the disk.
 const MAX_WAITING: usize = 65_536;
-/// Longer lines are no events: they hold a command or a script at most.
+/// Maximum length of an event's line in bytes; an event holds a command or a script at most.
 const MAX_LINE: u64 = 2 << 20;
 
 #[cfg(test)]

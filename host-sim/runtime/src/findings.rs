@@ -27,7 +27,7 @@ impl FindingTexts {
     }
 }
 
-/// When the newest command failed whose cause the state stream did not show.
+/// When the newest command failed for a reason that the state stream did not show.
 pub(crate) fn unexplained(status: Status<'_>) -> Option<Instant> {
     let failed = status.ports().filter(|port| port.reply == ReplyCode::Fail);
     let failed = failed.filter_map(|port| port.last_failed);

@@ -48,11 +48,11 @@ use tapping::Tapping;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Observers {
     pub watch: Watch,
-    /// Decodes frames for them.
+    /// Decodes frames for subscribers of `watch`.
     pub decoder: Arc<Decoder>,
     pub slot: Option<Arc<SnapshotSlot>>,
     pub snapshot_watch: Option<SnapshotWatch>,
-    /// Whether the log or the statistics are read, which report findings.
+    /// Whether the log or the statistics, which report findings, are read.
     pub readers: bool,
 }
 
@@ -85,9 +85,9 @@ struct PreparedGateway {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum TxPolicy {
     All,
-    /// None that send, neither to the controller nor to the field.
+    /// No output that sends, neither to the controller nor to the field.
     None,
-    /// Those of ports with exchanges; nothing to the controller.
+    /// Outputs of ports with exchanges; nothing to the controller.
     Exchanges,
 }
 
@@ -201,7 +201,6 @@ impl Core {
         }
     }
 
-    /// Copies the gateway of this instant.
     fn copy_to(&self, snapshot: &mut GatewaySnapshot, at: Instant) {
         snapshot.engine.clone_from(&self.engine.borrow());
         snapshot.at = at;
@@ -284,8 +283,8 @@ impl Core {
         }
     }
 
-    /// Logs once when a connection goes down, and when it is back. Not for links that the controller opens, which may
-    /// take days, nor for urgent commands: some controllers accept no second connection.
+    /// Logs once when a connection goes down, and when it is back. Links that the controller opens are not logged,
+    /// because that may take days, nor are urgent commands, because some controllers accept no second connection.
     fn log_link(&self, id: LinkId, is_up: bool) {
         if id == LinkId::URGENT {
             return;
@@ -355,7 +354,7 @@ impl Core {
         }
     }
 
-    /// Whether an output may be executed. A gateway that only listens sends nothing that this does not allow.
+    /// Whether an output may be executed. Everything that a listening gateway sends has passed this check.
     fn may(&self, output: &Output<'_>) -> bool {
         match (self.tx_policy, output) {
             (TxPolicy::All, _) => true,

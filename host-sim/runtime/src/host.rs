@@ -41,7 +41,7 @@ pub struct Handle {
     ready: Value,
     requests: mpsc::UnboundedSender<RuntimeRequest>,
     pub(super) watch: Watch,
-    /// Added to the statistics.
+    /// Texts that are added to the statistics.
     pub(super) findings: Option<FindingTexts>,
     home: Option<Home>,
 }
@@ -110,7 +110,7 @@ pub(super) fn start<S: Runtime>(
             Ok(Handle { ready, requests, watch: Watch::new(), findings: None, home: Some(home) })
         }
         Ok(Err(error)) => {
-            // Wait until everything is closed, so that another attempt can succeed.
+            // Waits until everything is closed, so another attempt can succeed.
             let _ = home.ended();
             Err(error)
         }

@@ -100,7 +100,7 @@ impl LinkControl {
         }
     }
 
-    /// Sends bytes at once if the kernel accepts them. The link's task reports that, and sends the rest.
+    /// Sends bytes at once if the kernel accepts them. The link's task reports that and sends the rest.
     pub(super) fn send(&self, bytes: &[u8]) {
         if self.outbox.borrow_mut().take(bytes) {
             self.sent.set(self.sent.get() + bytes.len() as u64);
@@ -287,7 +287,6 @@ pub(super) async fn probe(
     control.reach.replace(Some((Instant::now() + REACH_STAYS, reach)));
 }
 
-/// What an error says about the peer.
 fn reach_of(error: &io::Error) -> Reach {
     match error.kind() {
         io::ErrorKind::ConnectionRefused => Reach::Refused,
@@ -354,13 +353,13 @@ impl LinkTask<'_> {
 
 /// The default source addresses of programs on this host.
 const THIS_HOST: [IpAddr; 2] = [IpAddr::V4(Ipv4Addr::LOCALHOST), IpAddr::V6(Ipv6Addr::LOCALHOST)];
-/// How long a controller may take to accept a connection, as for the engine.
+/// How long a controller may take to accept a connection; the same as in the engine.
 const MAX_CONNECT: Duration = Duration::from_secs(2);
-/// An attempt says something for this long: a link that works is not tried again.
+/// How long the result of an attempt counts. A working link is not tried again.
 const REACH_COUNTS: Duration = Duration::from_secs(10);
-/// The only attempt of a probe says something to the end.
+/// The same for a probe, which makes only one attempt.
 const REACH_STAYS: Duration = Duration::from_secs(365 * 24 * 3_600);
-/// If the name's lookup takes longer, data that waited meanwhile is old.
+/// If the name lookup takes longer, data that waited meanwhile is old.
 const MAX_LOOKUP: Duration = Duration::from_millis(100);
 
 #[cfg(test)]

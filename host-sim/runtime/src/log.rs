@@ -1,18 +1,18 @@
 //! The log: lines that go to stderr, and the newest of them for a console.
 //!
-//! Writing a line costs a copy. A thread of its own writes, so that a reader that stops reading never blocks
-//! whoever logs. Beyond `MAX_WAITING` bytes lines are lost, and the next one that is not says how many.
+//! Logging a line costs a copy. A thread of its own writes, so a stderr that is not read never blocks a thread that
+//! logs. Beyond `MAX_WAITING` bytes lines are lost; the next written line says how many.
 
 use std::collections::VecDeque;
 use std::io::Write;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// The log. Clones are of the same log.
+/// The log. Clones share it.
 #[derive(Debug, Clone)]
 pub struct Log(Arc<LogLines>);
 
-/// Waits when it is dropped until waiting lines are written, if that takes less than half a second.
+/// When dropped, waits up to half a second until waiting lines are written.
 #[derive(Debug)]
 pub struct LastWrite(Log);
 
@@ -50,12 +50,12 @@ impl Log {
         Self(lines)
     }
 
-    /// Waits for the last lines when it is dropped.
+    /// A guard that waits for the last lines when it is dropped.
     pub fn last_write(&self) -> LastWrite {
         LastWrite(self.clone())
     }
 
-    /// A line, with its end.
+    /// Logs a line that includes its line end.
     pub fn put(&self, line: &[u8]) {
         self.0.put(line);
     }
@@ -142,7 +142,7 @@ fn plain(line: &str) -> String {
     text
 }
 
-/// Nothing that holds these locks can panic half way.
+/// No code that holds these locks can panic half way.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -153,7 +153,7 @@ pub const MAX_NEWEST: usize = 256;
 const MAX_LINE: usize = 1 << 10;
 /// Bytes that wait for the reader of stderr.
 const MAX_WAITING: usize = 1 << 20;
-/// Of these, the bytes that are looked at for the newest lines.
+/// Bytes of these that are searched for the newest lines.
 const MAX_STUCK: usize = 64 << 10;
 /// How long the end of the program waits for a reader.
 const LAST_WRITE: Duration = Duration::from_millis(500);

@@ -1,7 +1,7 @@
 //! Publishes the state of a gateway to a Sparkplug broker: the gateway's edge node (docs/fleet.md).
 //!
-//! It has an ordinary thread, which takes snapshots through a slot as the console does, and never blocks the gateway's
-//! thread. Another configuration is another node with a new session.
+//! An ordinary thread takes snapshots through a slot, as the console does, and never blocks the gateway's thread.
+//! Another configuration is another node with a new session.
 
 use std::io;
 use std::sync::Arc;
@@ -75,7 +75,7 @@ impl Publisher {
                     } => warn!("the broker did not take the node's death in time"),
                 }
             });
-            // Without waiting for a pending name lookup.
+            // Do not wait for a pending name lookup.
             runtime.shutdown_background();
         });
         Ok(Self {

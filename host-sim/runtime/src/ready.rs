@@ -1,7 +1,7 @@
 //! `--ready FILE`: a file with all addresses, which exists while they are open.
 //!
-//! It is created atomically and removed at the end. A ready file that an earlier run has left is removed before
-//! anything is opened, so that whoever waits for the file never reads an old one; any other file stays.
+//! It is created atomically and removed at the end. A ready file of an earlier run is removed before anything is
+//! opened, so a program that waits for the file never reads an old one. Any other file stays.
 
 use std::fs;
 use std::io;
@@ -19,7 +19,7 @@ pub struct ReadyFile {
 }
 
 impl ReadyFile {
-    /// The file at `path`, which is not written yet. One that an earlier run has left is removed.
+    /// The file at `path`, which is not written yet. A ready file of an earlier run is removed.
     ///
     /// # Errors
     /// If another kind of file is there, or it could not be written.
@@ -81,12 +81,12 @@ impl ReadyFile {
     }
 }
 
-/// A written ready file. Dropping it removes the file, unless that was changed.
+/// A written ready file. Dropping it removes the file, unless the file was changed.
 #[derive(Debug)]
 pub(super) struct WrittenReadyFile {
     path: PathBuf,
     text: String,
-    /// As long as it is open, no other file gets its inode number.
+    /// Kept open, so no other file gets its inode number.
     file: fs::File,
 }
 

@@ -1,9 +1,8 @@
 //! Notifications to the service manager: ready, alive, stopping.
 //!
-//! systemd gives a service of `Type=notify` a socket in `NOTIFY_SOCKET`, and one with `WatchdogSec=` the time
-//! within which it must say that it works in `WATCHDOG_USEC`. It says so only when the threads that move the
-//! robots' data have answered: a run whose main thread alone is alive is restarted. Without a service manager
-//! nothing is done.
+//! systemd gives a service of `Type=notify` a socket in `NOTIFY_SOCKET`, and with `WatchdogSec=` a timeout in
+//! `WATCHDOG_USEC`. The watchdog is notified only after all threads that move the robots' data have answered, so a run
+//! whose main thread alone is alive is restarted. Without a service manager nothing is done.
 
 use std::time::Duration;
 
@@ -14,7 +13,7 @@ use super::client::RuntimeClient;
 
 /// The service manager, from this process's environment.
 pub(super) struct Service {
-    /// The run is restarted if nothing is said for this long.
+    /// The watchdog timeout.
     patience: Option<Duration>,
 }
 
@@ -31,7 +30,7 @@ impl Service {
         tell(&[NotifyState::Stopping, NotifyState::Status("ending")]);
     }
 
-    /// Says again and again that the run works, as long as each of its threads answers. Never returns.
+    /// Notifies the watchdog as long as each thread answers. Never returns.
     pub(super) async fn keep_alive(&self, threads: impl Fn() -> Vec<RuntimeClient>) {
         self.each_beat(threads, || tell(&[NotifyState::Watchdog])).await;
     }

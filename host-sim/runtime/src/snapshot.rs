@@ -130,7 +130,7 @@ impl SnapshotSlot {
         }
     }
 
-    /// Supervisor's thread: has the safe values sent, and waits until the controller shows them, as far as it does. The
+    /// Supervisor's thread: has the safe values sent, and waits until the controller shows those that it reports. The
     /// gateway must be ended after this.
     pub(crate) fn make_safe(&self) {
         let (sender, receiver) = std::sync::mpsc::channel();
@@ -151,6 +151,6 @@ impl SnapshotSlot {
 }
 
 const MAX_WAIT: StdDuration = StdDuration::from_millis(500);
-/// Time for safe values to arrive: as long as they are repeated where nothing shows them
-/// (proto-core/docs/engine.md section 6).
+/// Maximum time for safe values to arrive: as long as values that nothing shows are repeated (proto-core/docs/engine.md
+/// section 6).
 pub(crate) const MAX_SAFE: StdDuration = StdDuration::from_secs(1);

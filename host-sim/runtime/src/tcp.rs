@@ -22,8 +22,7 @@ pub(super) struct Connection {
     out: RefCell<Vec<u8>>,
     blocked_since: Cell<Option<Instant>>,
     end: Cell<ConnectionEnd>,
-    /// Waker of the task in [`Connection::run`]. There is only one, so this is cheaper than a
-    /// [`tokio::sync::Notify`].
+    /// Waker of the only task in [`Connection::run`]; cheaper than a [`tokio::sync::Notify`].
     runner: RefCell<Option<Waker>>,
 }
 
@@ -236,8 +235,8 @@ impl Connection {
     }
 }
 
-/// Maximum number of bytes per read, whose requests are executed before other tasks run: the longest
-/// Modbus request.
+/// Maximum number of bytes per read, which is the longest Modbus request. Its requests are executed before other tasks
+/// run.
 const CHUNK: usize = 260;
 /// Maximum number of bytes that wait for a peer; more than the answers to the requests of one read.
 const MAX_UNSENT: usize = 64 * 1_024;

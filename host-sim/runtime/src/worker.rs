@@ -43,7 +43,7 @@ impl RuntimePlace {
         Self { span: Span::none(), shared: None }
     }
 
-    /// On a shared thread. It is opened at once, and runs after `begin`.
+    /// On a shared thread. The runtime is opened at once, and runs after `begin`.
     pub(crate) const fn among(worker: Arc<Worker>, begin: Begin, span: Span) -> Self {
         Self { span, shared: Some((worker, begin)) }
     }
@@ -80,7 +80,7 @@ impl Begin {
             && let Ok(timer) = Timer::new()
             && timer.arm(now() + self.after).is_ok()
         {
-            // If the timer fails, it begins at once.
+            // If the timer fails, the runtime begins at once.
             let _ = timer.expired().await;
         }
     }

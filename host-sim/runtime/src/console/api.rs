@@ -1,4 +1,4 @@
-//! The endpoints: what each operation answers.
+//! The endpoints: the reply to each operation.
 
 use std::ops::RangeInclusive;
 use std::rc::Rc;
@@ -76,7 +76,7 @@ impl ConsoleServer {
         }
     }
 
-    /// Tells a person beside several machines which one this is.
+    /// Lets a person in front of several machines find this one.
     fn identify(&self, request: &HttpRequest<'_>) -> HttpReply {
         let IdentifyArguments { s } = match arguments(&request.body) {
             Ok(arguments) => arguments,
@@ -92,7 +92,7 @@ impl ConsoleServer {
         HttpReply::json(StatusCode::OK, &json!({}))
     }
 
-    /// Requests that change the configuration, or what runs.
+    /// Handles requests that change the configuration or what runs.
     async fn change(&self, operation: ApiOperation, request: HttpRequest<'_>) -> HttpReply {
         let ConsoleSource::Gateway { shared, commands, .. } = &self.source else { return nothing_runs() };
         let what = match operation {
@@ -160,7 +160,7 @@ impl ConsoleServer {
     }
 }
 
-/// The image of a text for a board, or its first mistake.
+/// The board image of a configuration, or the first mistake in its text.
 fn image(toml: &str) -> HttpReply {
     match check::image(toml) {
         Ok(bytes) => HttpReply::image(bytes),
@@ -168,7 +168,7 @@ fn image(toml: &str) -> HttpReply {
     }
 }
 
-/// The text of the configuration that runs, or of the one that was asked for.
+/// The text of the running configuration, or of the requested revision.
 fn config(view: &SupervisorView, request: &HttpRequest<'_>) -> HttpReply {
     let Some(revisions) = &view.revisions else { return nothing_runs() };
     let number = match request.head.query("revision").map(str::parse) {
@@ -214,10 +214,10 @@ fn default_identify() -> u32 {
     10
 }
 
-/// For how many seconds a board shows itself. A host writes one line to its log.
+/// Seconds for which a board identifies itself. A host writes one line to its log.
 const IDENTIFY: RangeInclusive<u32> = 1..=600;
 
-/// The arguments in a body; none at all is an empty object.
+/// Parses the arguments in a body. An empty body counts as an empty object.
 fn arguments<T: serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, HttpReply> {
     let body = if body.is_empty() { b"{}" } else { body };
     // `from_slice::<T>` would accept an array as the fields of a struct.

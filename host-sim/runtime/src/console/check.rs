@@ -1,4 +1,4 @@
-//! Texts of configurations: whether they can run, or one mistake with its place.
+//! Checks the text of a configuration: whether it can run, or one mistake with its place.
 
 use std::sync::Arc;
 
@@ -12,14 +12,14 @@ use recipe_controller::Controller;
 use recipe_export::Model;
 use serde_json::{Map, Value, json};
 
-/// A gateway that can be started, and what its frames are called.
+/// A gateway that can be started, and the decoder of its frames.
 #[derive(Debug, Clone)]
 pub(super) struct Prepared {
     pub(super) config: Arc<GatewayConfig>,
     pub(super) decoder: Arc<Decoder>,
 }
 
-/// Everything that a gateway of this text needs before it is started.
+/// Prepares everything that a gateway of this text needs to start.
 pub(super) fn prepare(name: &str, toml: &str, overrides: &[String]) -> Result<Prepared, Box<Mistake>> {
     let config = gateway(name, toml, overrides)?;
     let model = Model::parse(Text { name, toml }, overrides).map_err(Mistake::of_file)?;
@@ -50,7 +50,7 @@ fn can_be_built(config: &SimConfig) -> Result<(), Box<Mistake>> {
     Controller::new(config).map(|_| ()).map_err(|error| Mistake::of_whole(&error))
 }
 
-/// The report on a text of either kind.
+/// The report on the text of a gateway's or a controller's configuration.
 pub(super) fn report(toml: &str) -> Value {
     let checked = file::parse(Text { name: NAME, toml }, &[]).map_err(Mistake::of_file);
     let checked = checked.and_then(|config| match config {

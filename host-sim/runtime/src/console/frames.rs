@@ -23,12 +23,12 @@ pub(super) struct FrameEvents {
 }
 
 impl FrameEvents {
-    /// Those from now on, of this port or of all.
+    /// Frames from now on, of this port or of all ports.
     pub(super) fn of(watch: &Watch, port: Option<String>) -> Self {
         Self { subscription: subscribe(watch), port, cell: None }
     }
 
-    /// The data of the next event: what waits, at most [`AT_ONCE`] frames. `None` if nothing does.
+    /// The data of the next event: at most [`AT_ONCE`] waiting frames; `None` if none wait.
     pub(super) fn event(&mut self) -> Option<(Value, u64)> {
         let (mut frames, mut lost) = (Vec::new(), 0);
         while frames.len() < AT_ONCE
@@ -94,12 +94,12 @@ pub(super) struct CaptureStream {
 }
 
 impl CaptureStream {
-    /// What comes from now on at this port, or at all.
+    /// Records from now on, of this port or of all ports.
     pub(super) fn of(watch: &Watch, port: Option<String>) -> Self {
         Self { subscription: subscribe(watch), capture: Pcapng::new(Scope { port, links: false }) }
     }
 
-    /// The blocks of what waits, about [`MAX_BLOCKS`] bytes at most; often none.
+    /// The blocks of the waiting records, at most about [`MAX_BLOCKS`] bytes; often none.
     pub(super) fn blocks(&mut self) -> Vec<u8> {
         let mut blocks = Vec::new();
         while blocks.len() < MAX_BLOCKS
@@ -117,7 +117,7 @@ fn subscribe(watch: &Watch) -> Subscription {
 
 /// Records that wait for a client: more than a second of busy ports.
 const QUEUE: usize = 4_096;
-/// Frames of one event.
+/// Maximum number of frames in an event.
 const AT_ONCE: usize = 256;
-/// Bytes of a capture that are made at once.
+/// Maximum number of bytes of a capture that are made at once.
 const MAX_BLOCKS: usize = 64 << 10;

@@ -20,7 +20,6 @@ use tracing::{debug, warn};
 use super::reply::{HttpReply, MAX_TIME, bytes_of};
 use super::{ConsoleServer, stream};
 
-/// A request with what belongs to it.
 pub(super) struct HttpRequest<'a> {
     pub(super) head: HttpHead<'a>,
     pub(super) admitted: Admitted,
@@ -29,7 +28,6 @@ pub(super) struct HttpRequest<'a> {
 }
 
 impl ConsoleServer {
-    /// Accepts connections for ever.
     pub(super) async fn accept(self: Rc<Self>, listener: TcpListener) {
         tcp_options::limit_buffers(&listener);
         loop {
@@ -48,7 +46,7 @@ impl ConsoleServer {
         self.count(|counters| counters.connections += 1);
         if self.connections.get() >= MAX_CONNECTIONS {
             self.count(|counters| counters.turned_away += 1);
-            // Without waiting for anything: there may be thousands.
+            // Do not wait for the client: there may be thousands of them.
             let reply = HttpReply::error(StatusCode::UNAVAILABLE, "too many connections; try again");
             let _ = stream.try_write(&bytes_of(&reply));
             return;
@@ -142,7 +140,7 @@ impl ConsoleServer {
         rest: Vec<u8>,
         deadline: Instant,
     ) -> io::Result<Option<Vec<u8>>> {
-        // The guard has limited it.
+        // The guard has limited the length.
         let length = usize::try_from(admitted.length).unwrap_or(0);
         let mut body = rest;
         body.truncate(length);
@@ -185,8 +183,8 @@ impl ConsoleServer {
     }
 }
 
-/// Reads what is left of a request: closing before that would reset the connection, and the client would not
-/// see why it was refused.
+/// Reads the rest of a request. Closing earlier would reset the connection, and the client would not see why it was
+/// refused.
 async fn linger(mut stream: TcpStream) -> io::Result<()> {
     let mut chunk = vec![0; 4_096];
     let read = async { while stream.read(&mut chunk).await.is_ok_and(|count| count > 0) {} };

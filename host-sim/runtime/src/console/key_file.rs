@@ -15,7 +15,7 @@ pub fn read_key(path: &Path) -> Result<Key, RunError> {
     let refused =
         |why: &dyn std::fmt::Display| RunError::new(format!("--console-key {}: {why}", path.display()));
     let text = read_private(path, 100).map_err(|error| refused(&error))?;
-    // The contents are not repeated: a mistyped key is almost one.
+    // Do not repeat the contents: a mistyped key is almost the key.
     Key::parse(text.trim_end()).ok_or_else(|| {
         refused(&"not 32 hexadecimal digits; `(umask 077; openssl rand -hex 16 > FILE)` makes a key")
     })

@@ -45,7 +45,7 @@ use snapshots::Snapshots;
 pub use supervisor::ConfigFile;
 pub(crate) use supervisor::Supervised;
 
-/// Stack of a thread that builds engines, which is done by value.
+/// Stack size of the console's thread, which builds engines by value.
 const STACK: usize = 16 << 20;
 
 /// Nice value of the console's thread.
@@ -56,11 +56,11 @@ const NICENESS: i32 = 10;
 pub struct ConsoleOptions {
     /// The address to listen on; port 0: any.
     pub address: SocketAddr,
-    /// The key. Without one nothing can be changed, and only this machine is served.
+    /// The key. Without a key nothing can be changed, and only this machine is served.
     pub key: Option<Key>,
-    /// The folder that keeps the last revisions of the configuration; without one they end with the process.
+    /// The folder for the last revisions of the configuration; without a folder they end with the process.
     pub state: Option<PathBuf>,
-    /// The port of the other half's console on this machine: the controller's for a gateway, and the reverse.
+    /// The port of the other program's console on this machine: the controller's for a gateway, and the reverse.
     pub peer: Option<u16>,
 }
 
@@ -189,7 +189,7 @@ pub fn run_gateway(file: ConfigFile, console: &ConsoleOptions, options: &RunOpti
 #[derive(Debug)]
 pub(crate) struct Consoled {
     ready: Value,
-    /// Ended first, so that no more requests are answered.
+    /// Dropped first, so no requests are answered during the shutdown.
     console: Option<Console>,
     handle: Handle,
 }

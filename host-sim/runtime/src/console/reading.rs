@@ -188,7 +188,7 @@ fn text(kind: ContentType, text: Option<Rc<str>>) -> HttpReply {
     text.map_or_else(nothing_runs, |text| HttpReply::text(kind, text))
 }
 
-/// The argument `port`. Names may have any character, so it is the one that is decoded.
+/// The argument `port`. A name may have any character, so this argument is percent-decoded.
 fn port_of<'a>(head: &HttpHead<'a>) -> Result<Option<Cow<'a, str>>, HttpReply> {
     let Some(port) = head.query("port") else { return Ok(None) };
     let decoded =
@@ -196,7 +196,7 @@ fn port_of<'a>(head: &HttpHead<'a>) -> Result<Option<Cow<'a, str>>, HttpReply> {
     decoded.map(Some)
 }
 
-/// A text with `%2F` and the like.
+/// Percent-decodes a text.
 fn decoded(text: &str) -> Option<Cow<'_, str>> {
     if !text.contains('%') {
         return Some(text.into());
@@ -252,7 +252,6 @@ pub(super) fn nothing_runs() -> HttpReply {
     HttpReply::error(StatusCode::UNAVAILABLE, "nothing runs at the moment; try again")
 }
 
-/// The machine's host name.
 pub(super) fn host_name() -> Option<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
     Some(name.trim().to_owned()).filter(|name| !name.is_empty())

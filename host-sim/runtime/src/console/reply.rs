@@ -15,7 +15,6 @@ pub(super) struct HttpReply {
     pub(super) fields: Vec<(&'static str, String)>,
 }
 
-/// What a response carries.
 #[derive(Debug)]
 pub(super) enum ReplyBody {
     Text(Rc<str>),
@@ -46,7 +45,7 @@ impl HttpReply {
         Self { status, kind, body: body.into(), fields: Vec::new() }
     }
 
-    /// A document that was made before.
+    /// A document that already exists.
     pub(super) fn text(kind: ContentType, body: Rc<str>) -> Self {
         Self::new(StatusCode::OK, kind, body)
     }

@@ -45,7 +45,7 @@ enum SnapshotContent {
 }
 
 impl Snapshots {
-    /// A snapshot that is young enough; `None` while nothing runs.
+    /// A snapshot not older than [`MAX_AGE`]; `None` while nothing runs.
     pub(super) async fn newest(&self, source: &ConsoleSource) -> Option<Rc<Snapshot>> {
         let _refresh = self.refresh.lock().await;
         if let Some(newest) = self.newest.borrow().as_ref()
@@ -130,7 +130,7 @@ impl Snapshot {
         Some(Rc::clone(self.metrics.get_or_init(|| make().into())))
     }
 
-    /// When the newest command failed whose cause the state stream did not show.
+    /// When the newest command failed for a reason that the state stream did not show.
     pub(super) fn unexplained(&self) -> Option<Instant> {
         let SnapshotContent::Gateway(snapshot, _) = &self.what else { return None };
         unexplained(snapshot.engine.status(snapshot.at))

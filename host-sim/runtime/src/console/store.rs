@@ -1,8 +1,8 @@
 //! The revisions of a configuration as files: `--console-state DIR`.
 //!
-//! `revisions.json` says which revisions there are and which one is live. It is replaced in one step, after the
-//! texts it names are on the disk, and before those it no longer names are removed. So at every moment, also
-//! when the power fails, it is true.
+//! `revisions.json` lists the revisions and says which one is live. It is replaced atomically, after the texts that it
+//! names are on the disk and before texts that it no longer names are removed, so it is correct at any time, even after
+//! a power failure.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -24,14 +24,14 @@ pub(super) struct RevisionStore {
     folder: Option<StoreFolder>,
     index: Index,
     texts: BTreeMap<u32, Arc<str>>,
-    /// The revision of the file that the process was started with, and the one it replaces; not written yet.
+    /// The revision of the file that the process was started with, not written yet, and the revision that it replaces.
     started_with: Option<(u32, Option<u32>)>,
 }
 
 #[derive(Debug)]
 struct StoreFolder {
     path: PathBuf,
-    /// Locked: one process uses a folder.
+    /// Held locked: only one process may use a folder.
     _lock: File,
 }
 
@@ -41,7 +41,7 @@ struct Index {
     live: u32,
     #[serde(default)]
     previous: Option<u32>,
-    /// Hash of the file that the process was started with when the live one became so.
+    /// Hash of the file that the process was started with when the live revision became live.
     file: String,
     kept: Vec<RevisionEntry>,
 }
@@ -57,8 +57,8 @@ pub(super) struct RevisionEntry {
 }
 
 impl RevisionStore {
-    /// The store of a folder, or of this process alone. If the file that the process was started with is
-    /// another one than before, a person has changed it: then it becomes the newest revision, and live.
+    /// Opens the store of a folder, or one in memory. If the file that the process was started with has changed, a
+    /// person has edited it: it becomes the newest revision, and live.
     pub(super) fn open(path: Option<&Path>, file: (&str, &str)) -> Result<Self, RunError> {
         let mut store =
             Self { folder: None, index: Index::default(), texts: BTreeMap::new(), started_with: None };
@@ -92,8 +92,8 @@ impl RevisionStore {
         Ok(store)
     }
 
-    /// Writes the revision of the file that the process was started with, now that it has started: a revision that does
-    /// not start replaces none.
+    /// Writes the revision of the file that the process was started with. Called once the gateway has started: a
+    /// revision that does not start replaces none.
     pub(super) fn has_started(&mut self) -> Result<(), RunError> {
         let Some((number, forget)) = self.started_with.take() else { return Ok(()) };
         let text = self.texts.get(&number).cloned().unwrap_or_default();
@@ -144,7 +144,7 @@ impl RevisionStore {
         Ok(())
     }
 
-    /// The index with another revision.
+    /// The index with a new revision, and without revision `forget`.
     fn with(&self, number: u32, from: &str, forget: Option<u32>) -> Index {
         let mut index = self.index.clone();
         index.kept.retain(|entry| Some(entry.number) != forget);
@@ -190,7 +190,7 @@ impl RevisionStore {
         };
         let Index { kept, live, .. } = &index;
         let is_rising = kept.is_sorted_by(|one, next| one.number < next.number);
-        // The next one has a number too.
+        // The next revision needs a number too.
         let is_last = kept.last().is_some_and(|last| last.number == u32::MAX);
         if kept.len() > MAX_REVISIONS || !is_rising || is_last {
             return Err(wrong(format!(
@@ -222,7 +222,7 @@ impl RevisionStore {
 }
 
 impl StoreFolder {
-    /// Replaces a file in one step that a power cut does not divide.
+    /// Replaces a file atomically, even if the power fails.
     fn replace(&self, name: &str, bytes: &[u8]) -> io::Result<()> {
         let place = self.path.join(name);
         let (beside, file) = Beside::file(&place, bytes)?;
@@ -233,7 +233,7 @@ impl StoreFolder {
     }
 }
 
-/// Makes the folder if there is none, and locks it.
+/// Creates the folder if it does not exist, and locks it.
 fn lock(path: &Path) -> io::Result<File> {
     fs::create_dir_all(path)?;
     let lock = File::options().create(true).truncate(false).write(true).open(path.join("lock"))?;

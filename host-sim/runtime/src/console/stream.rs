@@ -1,5 +1,5 @@
-//! Endless responses: server-sent events with state and values five times a second, and frames by name on request; and
-//! captures.
+//! Endless responses: captures, and server-sent events with state and values five times a second, and with decoded
+//! frames on request.
 //!
 //! A client that reads slowly gets fewer events, with the number of lost ones; one that does not read is disconnected.
 
@@ -137,7 +137,7 @@ async fn events(
     }
 }
 
-/// State and values, and how many of them were left out before.
+/// State and values, and the number of events left out before.
 async fn states(server: &ConsoleServer, lost: u64) -> String {
     let mut text = String::new();
     if lost > 0 {
@@ -178,7 +178,7 @@ async fn put(server: &ConsoleServer, write: &mut OwnedWriteHalf, bytes: &[u8]) -
     })
 }
 
-/// Bytes that the system keeps for a client.
+/// Bytes that the kernel buffers for a client.
 const SEND_BUFFER: usize = 16 << 10;
 /// Maximum number of streams; the other connections are for requests.
 const MAX_STREAMS: usize = 4;

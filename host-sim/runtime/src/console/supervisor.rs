@@ -1,8 +1,8 @@
-//! The gateway's configurations: runs one, tries another, returns to the one before.
+//! The gateway's configurations: runs one, tries another, returns to the previous one.
 //!
-//! In: commands of the console. Out: gateways that are started and ended, files, and a view for readers. What
-//! happens when is decided in `recipe_api::revisions`; here it is carried out, on a thread of its own,
-//! since starting and ending a gateway takes its time.
+//! In: commands of the console. Out: gateways that are started and ended, files, and a view for readers. Does not know
+//! when to do what: `recipe_api::revisions` decides. A thread of its own executes it, because starting and ending a
+//! gateway takes time.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -37,9 +37,9 @@ use crate::{RunError, RunOptions};
 /// The configuration that a gateway was started with.
 #[derive(Debug, Clone)]
 pub struct ConfigFile {
-    /// Its name.
+    /// Name of the file.
     pub name: String,
-    /// Its text.
+    /// Text of the file.
     pub toml: String,
     /// Overrides, which apply to every revision.
     pub overrides: Vec<String>,
@@ -92,12 +92,12 @@ pub(super) enum ActionError {
 #[derive(Debug, Default)]
 pub(crate) struct SupervisorView {
     pub(super) revisions: Option<Revisions>,
-    /// Their metadata, the oldest first.
+    /// Metadata of the revisions, the oldest first.
     pub(super) entries: Vec<RevisionEntry>,
     pub(super) texts: BTreeMap<u32, Arc<str>>,
     /// The addresses of what runs, as in the line `ready`.
     pub(super) ready: Value,
-    /// Why the newest revision that did not start did not.
+    /// Why the newest revision that failed to start failed.
     pub(super) failure: Option<String>,
     /// Overrides, which apply to every revision.
     pub(super) overrides: Vec<String>,
@@ -136,7 +136,7 @@ pub(crate) struct Supervised {
     shared: Arc<SharedView>,
     commands: blocking::Sender<SupervisorCommand>,
     thread: Option<JoinHandle<Result<(), RunError>>>,
-    /// Ended first, so that no more requests are answered.
+    /// Dropped first, so no requests are answered during the shutdown.
     console: Option<Console>,
 }
 
@@ -299,7 +299,7 @@ impl Supervisor {
         }
     }
 
-    /// The gateway has ended by itself. What was live ends the process, as it does without a console.
+    /// Handles a gateway that has ended by itself. If it was live, the process ends, as it does without a console.
     fn has_ended(&mut self) -> Result<(), RunError> {
         let Some(running) = self.running.take() else { return Ok(()) };
         let ended = running.handle.shutdown();
@@ -390,10 +390,10 @@ impl Supervisor {
         kept.is_ok()
     }
 
-    /// Runs a revision instead of what runs. What is wrong with it shows before anything is stopped.
+    /// Replaces the running gateway by this revision. Mistakes in the revision are found before anything is stopped.
     fn replace_by(&mut self, number: u32) -> Result<(), RunError> {
         if self.running.as_ref().is_some_and(|running| running.number == number) {
-            // The one that was to take its place could not be prepared.
+            // Its replacement could not be prepared.
             return Ok(());
         }
         let prepared = self.prepare(number)?;

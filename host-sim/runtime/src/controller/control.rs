@@ -1,7 +1,7 @@
 //! The control socket (docs/control.md section 1): JSON lines, and what each asks for.
 //!
-//! Requests of one client are executed in order. A client that does not read its answers is not read; one
-//! that follows events and does not read loses those that the controller no longer keeps.
+//! Requests of a client are executed in order. While a client does not read its answers, its requests are not read. A
+//! client that follows events and does not read them loses those that the controller no longer keeps.
 
 use std::cell::{Cell, RefCell};
 use std::io;
@@ -30,20 +30,20 @@ use recipe_io::timer;
 pub(super) struct ControlClient {
     /// Lines that wait for the client.
     out: RefCell<Vec<u8>>,
-    /// Since when the system has accepted none of them.
+    /// Since when the system has accepted none of these bytes.
     blocked_since: Cell<Option<Instant>>,
-    /// The events that it follows.
+    /// The events that the client follows.
     follows: RefCell<Option<Follow>>,
-    /// Whether it makes no more requests.
+    /// The client makes no more requests.
     has_ended: Cell<bool>,
     wake: Notify,
-    /// Wakes its reading half after a write.
+    /// Wakes the client's reading half after a write.
     written: Notify,
 }
 
 #[derive(Debug)]
 struct Follow {
-    /// All if it is empty.
+    /// Empty: all kinds.
     kinds: Vec<String>,
     /// Number of the next event.
     next: u64,
@@ -73,7 +73,7 @@ impl ControlClient {
         self.blocked_since.get()
     }
 
-    /// Makes it write the events that it follows.
+    /// Wakes the task that writes the events that the client follows.
     pub(super) fn notify(&self) {
         if self.follows.borrow().is_some() {
             self.wake.notify_one();
@@ -82,7 +82,7 @@ impl ControlClient {
 
     fn push(&self, line: &impl Serialize) {
         let mut out = self.out.borrow_mut();
-        // Writing to memory never fails, nor does a value that came from JSON.
+        // Cannot fail: the value came from JSON and is written to memory.
         let _ = serde_json::to_writer(&mut *out, line);
         out.push(b'\n');
         if self.blocked_since.get().is_none() {
@@ -224,7 +224,7 @@ impl ControllerRuntime {
         ControlReply { id, ok, time_s, result, error }
     }
 
-    /// Adds the events that a client follows to what waits for it, while there is room.
+    /// Adds the events that a client follows to its waiting bytes, while there is room.
     fn push_events(&self, client: &ControlClient) {
         let mut follows = client.follows.borrow_mut();
         let Some(follow) = follows.as_mut() else { return };
@@ -245,7 +245,7 @@ impl ControllerRuntime {
         }
     }
 
-    /// Writes what waits for a client, until it has ended and nothing waits.
+    /// Writes the client's waiting bytes until the client has ended and none wait.
     async fn write(&self, client: &ControlClient, write: &OwnedWriteHalf) -> io::Result<()> {
         loop {
             self.push_events(client);
@@ -283,7 +283,7 @@ enum ControlLine {
     End,
 }
 
-/// Reads a line without its end. The last one needs none.
+/// Reads a line without its end. The last line needs no end.
 async fn next_line(read: &mut BufReader<OwnedReadHalf>, line: &mut Vec<u8>) -> io::Result<ControlLine> {
     line.clear();
     loop {
@@ -304,7 +304,7 @@ async fn next_line(read: &mut BufReader<OwnedReadHalf>, line: &mut Vec<u8>) -> i
     }
 }
 
-/// Maximum number of clients, and of those that get this error.
+/// Maximum number of clients, and of refused clients that are told so.
 pub(super) const MAX_CLIENTS: usize = 16;
 /// Maximum length of a request, in bytes.
 pub(super) const MAX_LINE: usize = 1 << 20;

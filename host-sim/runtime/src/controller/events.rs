@@ -30,7 +30,7 @@ impl ControllerRuntime {
             match what {
                 // The program itself has logged it.
                 Happened::Log { .. } => {}
-                // A fast recipe writes hundreds of times per second.
+                // A fast recipe writes hundreds of variables per second.
                 Happened::Write { .. } => trace!(target: "controller", time_s, "{what}"),
                 _ => info!(target: "controller", time_s, "{what}"),
             }

@@ -46,7 +46,7 @@ impl RunningController {
         let alarm =
             || clock.alarm().map_err(|error| RunError::new(format!("cannot create a timer: {error}")));
         let (timer, timeline_alarm) = (alarm()?, alarm()?);
-        // The last that can fail: an earlier run's file is kept if this one cannot start.
+        // The last step that can fail: an earlier run's file is kept if this run cannot start.
         let events_file = options.events.as_ref().map(EventsFile::create).transpose()?;
         ready.insert("ports".to_owned(), json!(places));
         let runtime = Rc::new(ControllerRuntime {
@@ -103,7 +103,6 @@ impl RunningController {
     }
 }
 
-/// What the controller's clients connect and send to.
 struct ControllerSockets {
     command: TcpListener,
     state: TcpListener,
@@ -111,7 +110,7 @@ struct ControllerSockets {
     control: TcpListener,
     udp: UdpSocket,
     udp_at: SocketAddr,
-    /// Their addresses, by their names in the file.
+    /// Addresses of the sockets, by their names in the file.
     ready: Map<String, Value>,
 }
 

@@ -41,7 +41,7 @@ impl ControllerRuntime {
         }
     }
 
-    /// A TCP client port: connects, and connects again when the connection is lost.
+    /// A TCP client port: connects, and reconnects when the connection is lost.
     pub(super) async fn connect_out(self: Rc<Self>, port: usize, to: String) {
         let Some(Outward::Tcp(slot)) = self.ports.get(port) else { return };
         let mut backoff = Backoff::new(MIN_PAUSE, MAX_PAUSE);

@@ -9,9 +9,9 @@ use super::ControllerRuntime;
 use recipe_controller::ControllerInput;
 
 impl ControllerRuntime {
-    /// Does the steps that are due, after each change of the controller.
+    /// Executes the steps that are due, after each change of the controller.
     pub(super) fn play(&self) {
-        // A step that is being done changes the controller too.
+        // A step that is being executed changes the controller too.
         if self.timeline.borrow().is_none() || self.is_playing.replace(true) {
             return;
         }

@@ -47,7 +47,7 @@ impl ControllerRuntime {
         let (connection, read) = Connection::split(stream);
         let client = ServerClient { link, connection: Rc::clone(&connection), subscribed: false };
         self.connections.borrow_mut().insert(conn, client);
-        // An IPv4 client of an IPv6 listener.
+        // An IPv4 client of an IPv6 listener has a mapped address.
         let from = peer.ip().to_canonical();
         self.input(match link {
             Link::Command => ControllerInput::CommandOpened { conn, from },

@@ -7,7 +7,6 @@ use serde_json::{Value, json};
 use super::{ControllerRuntime, Outward};
 
 impl ControllerRuntime {
-    /// One line of statistics.
     pub(super) fn stats(&self) -> Value {
         let controller = self.controller.borrow();
         let machine = controller.machine();
@@ -39,7 +38,7 @@ impl ControllerRuntime {
     }
 }
 
-/// A register's value; bits and words without a fraction.
+/// The JSON of a register's value; bits and words have no fraction.
 fn number(value: Scalar) -> Value {
     match value {
         Scalar::Byte(bits) => json!(bits),

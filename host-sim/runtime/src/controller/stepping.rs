@@ -1,8 +1,8 @@
 //! The controller's clock: waits, and how a stepped clock moves.
 //!
-//! A stepped clock moves while somebody waits: from one deadline to the next. At each instant it stands until
-//! everything that was sent has left and everything that has arrived is handled, so that a run depends on what
-//! its clients do and not on the speed of the machine.
+//! A stepped clock moves from one deadline to the next while a client waits. At each instant it stands until everything
+//! sent has left and everything received is handled, so a run depends on its clients and not on the speed of the
+//! machine.
 
 use std::rc::Rc;
 
@@ -29,7 +29,7 @@ pub(super) struct WaitingClient {
 }
 
 impl ControllerRuntime {
-    /// Moves a stepped clock by this time; returns when it is there and everything is handled.
+    /// Moves a stepped clock by this time; returns when it has arrived and everything is handled.
     pub(super) async fn advance_clock(&self, seconds: f64) -> Result<(), String> {
         if !self.clock.is_stepped() {
             return Err("the clock runs by itself; `advance` needs --time stepped, `wait` does not".into());
@@ -138,7 +138,7 @@ impl ControllerRuntime {
                     tx.look();
                 }
             }
-            // Sockets are polled, and all tasks run, before this continues.
+            // All sockets are polled and all tasks run before this continues.
             yield_now().await;
             let now = timer::now();
             let is_quiet = self.activity.get() == before
@@ -177,11 +177,11 @@ impl ControllerRuntime {
     }
 }
 
-/// After so many rounds of all tasks without an event, an instant is over: an event may pass several tasks.
+/// Rounds of all tasks without an event after which an instant is over; several, as an event may pass several tasks.
 const QUIET_ROUNDS: u32 = 4;
-/// The least time without an event, for what the kernel passes on by a thread of its own.
+/// Minimum time without an event, for data that the kernel passes on with a thread of its own.
 const MIN_QUIET: Duration = Duration::from_micros(30);
 /// How long a stepped clock waits for a peer that reads nothing.
 const MAX_BLOCKED: Duration = Duration::from_millis(200);
-/// How long it stands at one instant for clients that never pause.
+/// How long a stepped clock stands at one instant for clients that never pause.
 const MAX_SETTLE: Duration = Duration::from_secs(1);

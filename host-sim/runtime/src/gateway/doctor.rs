@@ -54,7 +54,7 @@ impl Core {
         }
     }
 
-    /// What is known of a link beyond the engine's status.
+    /// Facts about a link that the engine's status does not have.
     pub(super) fn facts_of(&self, link: LinkId) -> LinkFacts {
         let control = self.links.get(&link);
         LinkFacts {
@@ -74,7 +74,7 @@ impl Core {
         }
     }
 
-    /// Passes a snapshot to the doctor's thread once a second.
+    /// Passes a snapshot to the examining thread once a second.
     pub(super) async fn be_watched(&self, doctor: Doctor) -> Result<(), RunError> {
         let mut ticks = tokio::time::interval(LOOK);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);

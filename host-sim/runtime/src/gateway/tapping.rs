@@ -20,12 +20,11 @@ use proto_core::wire::can::CanId;
 use recipe_capture::{Cell, Frame, Record, Watch, What};
 use rtrb::{Consumer, Producer, RingBuffer};
 
-/// Bytes of the ring between the threads, more than a second of busy ports. Its pages are not there until they
-/// are used.
+/// Bytes of the ring between the threads: more than a second of busy ports. Pages are allocated on first use.
 const RING: usize = 8 << 20;
-/// Longest message: the passes of an engine are far shorter, its configuration too.
+/// Maximum length of a message. Passes of an engine and its configuration are far shorter.
 const MAX_MESSAGE: usize = 128 << 10;
-/// Poll interval of the reader when the ring is empty. The gateway does not wake it, which would be a system call.
+/// Poll interval of the reader while the ring is empty. The gateway does not wake it: that would be a system call.
 const READ_INTERVAL: Duration = Duration::from_millis(2);
 
 #[derive(Debug)]
@@ -67,7 +66,7 @@ impl Tapping {
         Ok(tapping)
     }
 
-    /// Before the engine is called.
+    /// Called before the engine is.
     #[inline]
     pub(super) fn before(&mut self, tap: &mut Tap, at: Instant, input: Input<'_>) {
         let wanted = self.watch.wanted();
@@ -90,7 +89,7 @@ impl Tapping {
         }
     }
 
-    /// What the engine returned.
+    /// Records an output of the engine.
     #[inline]
     pub(super) fn output(&mut self, output: Output<'_>) {
         if self.records_passes {
@@ -108,7 +107,7 @@ impl Tapping {
         }
     }
 
-    /// The engine ends: what it became.
+    /// Records the final totals of the engine.
     pub(super) fn end<const P: usize, const U: usize, const F: usize, const E: usize>(
         &mut self,
         engine: &Engine<P, U, F, TAP, E>,
@@ -172,7 +171,7 @@ impl Tapping {
         entry.encode(|bytes| self.put(bytes));
     }
 
-    /// Appends to the message, whose memory was allocated at the start.
+    /// Appends to the message without allocating.
     fn put(&mut self, bytes: &[u8]) {
         if self.message.capacity() - self.message.len() >= bytes.len() {
             self.message.extend_from_slice(bytes);
@@ -205,7 +204,7 @@ impl Drop for Tapping {
     }
 }
 
-/// The other side of the ring, on a thread of its own.
+/// The reading side of the ring, on a thread of its own.
 struct RingReader {
     watch: Watch,
     ring: Consumer<u8>,
@@ -236,7 +235,7 @@ impl RingReader {
     fn next(&mut self) -> Option<Record> {
         let mut len = [0; 4];
         self.ring.pop_entire_slice(&mut len).ok()?;
-        // A message is in the ring as a whole.
+        // Messages are pushed as a whole.
         self.message.resize((u32::from_le_bytes(len) as usize).saturating_sub(len.len()), 0);
         self.ring.pop_entire_slice(&mut self.message).ok()?;
         parse(&self.message)

@@ -1,7 +1,7 @@
 //! Links over TCP.
 //!
-//! Besides what the system has accepted, a connection reports what the peer has acknowledged. However the
-//! connection ends, data that was not acknowledged by then is never delivered.
+//! A connection reports what the kernel has accepted and what the peer has acknowledged. However the connection ends,
+//! data that was not acknowledged by then is never delivered.
 
 use std::io;
 use std::net::IpAddr;
@@ -88,7 +88,7 @@ impl LinkTask<'_> {
                 let count = |refusals: &mut Refusals| refusals.refused += 1;
                 self.control.refuse(self.name, peer, "the link is closed", count);
             }
-            // Not each time, so that a client that connects again at once is not closed again.
+            // Yields only after several: a client that reconnects at once must not be closed again.
             if nth.is_multiple_of(CLOSED_AT_ONCE) {
                 yield_fairly().await;
             }
@@ -127,12 +127,12 @@ struct LinkConnection<'a> {
 /// How acknowledgements are monitored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum AckWatch {
-    /// Not at all, and the system has no time limit either.
+    /// Not monitored, and the kernel has no time limit either.
     Off,
-    /// Some are missing: they are polled.
+    /// Some acknowledgements are missing; they are polled.
     Missing,
-    /// None is missing, for less than [`QUIET`]. The system keeps its time limit, which a transmission each few
-    /// milliseconds would otherwise set and remove again.
+    /// None has been missing for less than [`QUIET`]. The kernel keeps its time limit; otherwise a transmission every
+    /// few milliseconds would set and remove it each time.
     Quiet,
 }
 
@@ -234,7 +234,7 @@ impl<'a> LinkConnection<'a> {
         self.link.control.sent.get() != self.acked
     }
 
-    /// Reports acknowledgements, if there are new ones.
+    /// Reports new acknowledgements.
     fn poll_acked(&mut self, events: &mut impl FnMut(LinkEvent<'_>)) -> io::Result<()> {
         if self.is_over() || !self.is_outstanding() {
             return Ok(());
@@ -252,12 +252,11 @@ impl<'a> LinkConnection<'a> {
 
 /// Interval at which acknowledgements are polled, while some are missing.
 const ACK_POLL: Duration = Duration::from_millis(10);
-/// After this time without acknowledgement the system itself ends the connection, in case this process
-/// cannot.
+/// After this time without acknowledgement the kernel ends the connection, in case this process cannot.
 const USER_TIMEOUT: Duration = Duration::from_secs(2);
 const CHUNK: usize = 2_048;
-/// Time without missing acknowledgements after which the system's time limit is removed: long before the first keepalive
-/// probe, with which it must not meet.
+/// Time without missing acknowledgements after which the kernel's time limit is removed. Far below the time of the
+/// first keepalive probe, whose loss would end the connection while the limit is set.
 const QUIET: Duration = Duration::from_millis(100);
 /// Number of reads before other tasks run.
 const READS_AT_ONCE: u64 = 16;

@@ -121,7 +121,7 @@ impl LinkTask<'_> {
 }
 
 struct UdpPeer<'a> {
-    /// The sender of the newest frame, which gets the answers. Other datagrams do not change it.
+    /// The sender of the newest frame, which gets the replies. Other datagrams do not change it.
     peer: SocketAddr,
     known: Vec<IpAddr>,
     is_frame: &'a dyn Fn(&[u8]) -> bool,
