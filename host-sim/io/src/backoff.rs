@@ -28,7 +28,7 @@ impl Backoff {
         pause
     }
 
-    /// Waits before the next attempt, as long as [`Self::pause`] says.
+    /// Sleeps for [`Self::pause`] before the next attempt.
     pub async fn wait(&mut self) {
         tokio::time::sleep(self.pause()).await;
     }

@@ -70,7 +70,7 @@ pub enum Device {
 /// The speed at which sent data appears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Pace {
-    /// At once. On a serial line, the next frame still waits as long as this one takes at the baud rate.
+    /// At once. On a serial line, the next frame still waits until this frame would have been sent at the baud rate.
     #[default]
     AtOnce,
     /// At the bit rate: byte by byte on a serial line, as a UART delivers them; frame by frame on a CAN bus.
@@ -78,12 +78,12 @@ pub enum Pace {
 }
 
 impl Device {
-    /// Whether a serial port of the configuration can be bound to it.
+    /// Whether a serial port of the configuration can be bound to the device.
     pub fn is_serial(&self) -> bool {
         !self.is_can()
     }
 
-    /// Whether a CAN port of the configuration can be bound to it.
+    /// Whether a CAN port of the configuration can be bound to the device.
     pub fn is_can(&self) -> bool {
         matches!(self, Self::SocketCan { .. } | Self::SlcanPty { .. } | Self::SlcanTcp { .. })
     }

@@ -24,7 +24,7 @@ use crate::timer::now;
 pub(crate) use clients::{Clients, SlcanClient, SlcanSession};
 use clients::{serve, serve_all};
 
-/// A bus; a clone is the same bus.
+/// A bus. Clones share it.
 #[derive(Debug, Clone)]
 pub(crate) struct CanBus {
     shared: Rc<BusState>,
@@ -36,7 +36,7 @@ struct BusState {
     nodes: RefCell<Vec<Rc<NodeState>>>,
     deadline_moved: Notify,
     clock: Clock,
-    /// For the counter of dropped frames.
+    /// Counts dropped frames.
     tx: Rc<PortTx>,
 }
 
@@ -56,12 +56,12 @@ struct NodeState {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct SentFrames {
     pub(crate) frames: u64,
-    /// Their data bytes.
+    /// Data bytes of the frames.
     pub(crate) bytes: u64,
 }
 
 impl CanBus {
-    /// A bus without nodes. Frames that they drop are counted at `tx`; they take their time on `clock`.
+    /// A bus without nodes. Frames that nodes drop are counted at `tx`; transmissions take their time on `clock`.
     pub(crate) fn new(pacing: Pacing, tx: Rc<PortTx>, clock: Clock) -> Self {
         let wire = RefCell::new(Wire::new(pacing));
         let (nodes, deadline_moved) = (RefCell::default(), Notify::new());
@@ -190,7 +190,7 @@ impl BusNode {
         }
     }
 
-    /// Starts or stops receiving frames of other nodes. Stopping drops those that wait.
+    /// Starts or stops receiving frames of other nodes. Stopping drops the waiting frames.
     pub(crate) fn set_receiving(&self, is_receiving: bool) {
         self.state.is_receiving.set(is_receiving);
         if !is_receiving {
@@ -217,7 +217,7 @@ pub(super) struct CanPort {
     pty: Option<(Rc<Pty>, Rc<RefCell<SlcanSession>>)>,
     listener: Option<Rc<TcpListener>>,
     clients: Rc<Clients>,
-    /// Another owner had it before, and something may wait in it.
+    /// The device was taken over, and old input may wait in it.
     is_handed_over: bool,
     bitrate: u32,
     pacing: Pacing,
@@ -235,7 +235,7 @@ pub(crate) struct HandoverBus {
     pub(crate) clients: Vec<(std::net::TcpStream, SlcanSession)>,
 }
 
-/// The same of a bus whose tasks still run.
+/// The clients' side of a bus whose tasks still run.
 #[derive(Debug)]
 pub(crate) struct HeldBus {
     pub(crate) bitrate: u32,
@@ -288,8 +288,7 @@ impl CanPort {
         Ok(Self { pty, listener, clients, is_handed_over, bitrate, pacing, tx, clock: Clock::real() })
     }
 
-    /// If there are a listener and a terminal, the listener's address: the terminal's link is in the
-    /// `--bind`.
+    /// With both a listener and a terminal, the listener's address: the `--bind` has the terminal's link.
     pub(super) fn place(&self) -> String {
         match (&self.listener, &self.pty) {
             (Some(listener), _) => stream::address_of(listener),
@@ -298,7 +297,6 @@ impl CanPort {
         }
     }
 
-    /// What clients are connected to.
     pub(super) fn held(&self) -> HeldBus {
         HeldBus {
             bitrate: self.bitrate,
@@ -338,7 +336,6 @@ impl CanPort {
     }
 }
 
-/// The port's own node.
 async fn port_node(node: &BusNode, tx: &PortTx, events: &mut impl FnMut(PortEvent<'_>)) {
     loop {
         tokio::select! {
@@ -364,7 +361,7 @@ async fn port_node(node: &BusNode, tx: &PortTx, events: &mut impl FnMut(PortEven
     }
 }
 
-/// Queues as many of the port's frames as its node takes.
+/// Queues as many of the port's frames as its node accepts.
 fn hand_over(node: &BusNode, tx: &PortTx) {
     while !node.is_full() {
         let Some(frame) = tx.frames.borrow_mut().pop_front() else { return };

@@ -1,8 +1,8 @@
-//! The clock of a state machine: the machine's own time, the same faster or slower, or one that moves only
-//! on command.
+//! The clock of a state machine: the machine's own time, the same faster or slower, or a clock that moves only on
+//! command.
 //!
-//! All clones of a [`Clock`] show the same time. An [`Alarm`] waits for an instant of its clock, as a
-//! [`Timer`] does for one of the machine's.
+//! All clones of a [`Clock`] show the same time. An [`Alarm`] waits for an instant of its clock, as a [`Timer`] does
+//! for an instant of the machine's clock.
 
 use std::cell::{Cell, RefCell};
 use std::io;
@@ -16,10 +16,10 @@ use super::timer::{self, Timer};
 /// How a clock runs.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Pace {
-    /// As the machine's.
+    /// At the machine's speed.
     #[default]
     Real,
-    /// So many times as fast as the machine's. More than 0.
+    /// The machine's speed multiplied by this, which is more than 0.
     Factor(f64),
     /// Only by [`Clock::step_to`].
     Stepped,
@@ -46,7 +46,7 @@ struct Scale {
 #[derive(Debug)]
 struct Stepped {
     now: Cell<Instant>,
-    /// Alarms in the order of their creation.
+    /// In the order of creation.
     alarms: RefCell<Vec<Rc<SteppedAlarm>>>,
 }
 
@@ -57,7 +57,7 @@ struct SteppedAlarm {
 }
 
 impl Clock {
-    /// A clock of this pace. A stepped one starts at [`STEPPED_START`], the others at the machine's time.
+    /// A clock of this pace. A stepped clock starts at [`STEPPED_START`], any other at the machine's time.
     pub fn new(pace: Pace) -> Self {
         Self(Rc::new(match pace {
             Pace::Real => ClockKind::Real,
@@ -75,7 +75,7 @@ impl Clock {
         Self::new(Pace::Real)
     }
 
-    /// The time.
+    /// The current time of this clock.
     pub fn now(&self) -> Instant {
         match &*self.0 {
             ClockKind::Real => timer::now(),
@@ -84,12 +84,12 @@ impl Clock {
         }
     }
 
-    /// Whether it moves only by [`Self::step_to`].
+    /// Whether the clock moves only by [`Self::step_to`].
     pub fn is_stepped(&self) -> bool {
         matches!(&*self.0, ClockKind::Stepped(_))
     }
 
-    /// Whether it shows another time than the machine.
+    /// Whether the clock differs from the machine's.
     pub fn runs_apart(&self) -> bool {
         !matches!(&*self.0, ClockKind::Real)
     }
@@ -100,7 +100,7 @@ impl Clock {
         self.deadlines(|deadline, now| deadline > now)
     }
 
-    /// Whether an alarm of a stepped clock is due whose task has not run yet.
+    /// Whether an alarm of a stepped clock is due and its task has not run yet.
     pub fn has_due(&self) -> bool {
         self.deadlines(|deadline, now| deadline <= now) != Instant::NEVER
     }
@@ -112,8 +112,8 @@ impl Clock {
         deadlines.filter(|&deadline| counts(deadline, now)).min().unwrap_or(Instant::NEVER)
     }
 
-    /// Moves a stepped clock to this instant, and wakes the alarms that are due then. Never backwards, and
-    /// without effect on a clock that runs by itself.
+    /// Moves a stepped clock to this instant and wakes the alarms that are due. Never moves it back, and has no effect
+    /// on a clock that runs by itself.
     pub fn step_to(&self, instant: Instant) {
         let ClockKind::Stepped(stepped) = &*self.0 else { return };
         stepped.now.set(instant.max(stepped.now.get()));
@@ -142,7 +142,7 @@ impl Scale {
         self.since + Duration::from_micros((passed * self.factor) as u64)
     }
 
-    /// When the clock shows this instant, not earlier.
+    /// The machine's time at which the clock shows this instant, rounded up.
     fn real(&self, shown: Instant) -> Instant {
         if shown == Instant::NEVER {
             return shown;
@@ -167,7 +167,7 @@ enum Waits {
 }
 
 impl Alarm {
-    /// Moves the deadline. One in the past expires at once; [`Instant::NEVER`] disarms the alarm.
+    /// Moves the deadline. A past deadline expires at once; [`Instant::NEVER`] disarms the alarm.
     pub fn arm(&self, deadline: Instant) -> io::Result<()> {
         self.armed.set(deadline);
         match (&self.waits, &*self.clock.0) {
@@ -196,7 +196,7 @@ impl Alarm {
                     }
                 }
                 Waits::Stepped(alarm) => {
-                    // A notification may be of an earlier deadline.
+                    // The notification may belong to an earlier deadline.
                     if alarm.armed.get() > self.clock.now() {
                         alarm.due.notified().await;
                         continue;
@@ -218,11 +218,11 @@ impl Drop for Alarm {
     }
 }
 
-/// What a stepped clock shows first: not 0, which some state machines take for "never".
+/// The start of a stepped clock: not 0, which some state machines take for "never".
 pub const STEPPED_START: Instant = Instant::from_millis(1_000);
-/// The slowest clock.
+/// The slowest pace.
 pub const MIN_FACTOR: f64 = 0.001;
-/// The fastest clock that runs by itself.
+/// The fastest pace of a clock that runs by itself.
 pub const MAX_FACTOR: f64 = 1_000.0;
 
 #[cfg(test)]

@@ -4,8 +4,8 @@ use std::io;
 
 use tokio::net::{TcpStream, ToSocketAddrs};
 
-/// Connects, but never to itself. A client that keeps trying a local port without a listener is sooner or
-/// later given that port as its own, and TCP then connects the socket to itself.
+/// Connects, but never to itself. A client that keeps trying a local port without a listener eventually gets that port
+/// as its own, and TCP then connects the socket to itself.
 ///
 /// # Errors
 /// As [`TcpStream::connect`]; a connection to itself is reported as refused.

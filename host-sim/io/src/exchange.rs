@@ -1,4 +1,4 @@
-//! Between a port's device and the port's owner: events, a handle for sending, and the device's counters.
+//! Between a port's device and the port's owner: events, a handle to send with, and the device's counters.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -26,8 +26,7 @@ pub enum PortEvent<'a> {
         /// The frame.
         frame: CanFrame,
     },
-    /// The error state of a CAN controller; reported after each [`PortEvent::Up`], if it is known, and when
-    /// it changes.
+    /// The error state of a CAN controller, if known: after each [`PortEvent::Up`], and when it changes.
     Bus(BusState),
     /// Everything sent so far has left.
     Sent,
@@ -40,7 +39,7 @@ pub struct PortTx {
     pub(super) frames: RefCell<VecDeque<CanFrame>>,
     pub(super) wake: Notify,
     pub(super) counters: Cell<DeviceCounters>,
-    /// For lines about clients.
+    /// Limits log lines about clients.
     pub(super) log_limit: LogLimit,
     /// Data read before this instant may have waited while the process slept.
     stale_until: Cell<Instant>,
@@ -52,23 +51,23 @@ pub struct PortTx {
 }
 
 impl PortTx {
-    /// Makes a serial line or an slcan terminal look for received bytes now: the kernel passes on a
-    /// terminal's bytes later, unless they are asked for.
+    /// Makes a serial line or an slcan terminal check for received bytes now: otherwise the kernel passes a terminal's
+    /// bytes on later.
     pub fn look(&self) {
         self.looked.notify_one();
     }
 
-    /// The process slept until now, so the age of data waiting in the device is unknown. The port's owner
-    /// discards everything for [`STALE`]; no old data may be left then.
+    /// The process slept until now, so the age of data waiting in the device is unknown. The port's owner discards all
+    /// input for [`STALE`]; no old data may be left after that.
     pub fn note_sleep(&self, now: Instant) {
         self.stale_until.set(now + STALE);
         self.sleeps.set(self.sleeps.get().wrapping_add(1));
-        // Several clients of a bus may wait. One that does not wait now compares the count before it does.
+        // Several clients of a bus may wait. A client that is not waiting compares the count before it waits again.
         self.slept.notify_waiters();
     }
 
-    /// Nobody read the device until now, which was taken over from another owner. What is read for [`STALE`] is
-    /// dropped by the device's task: the port's owner knows nothing of it.
+    /// The device was taken over, and nobody has read it until now. The device's task drops input for [`STALE`],
+    /// because the port's owner knows nothing of the gap.
     pub(super) fn note_gap(&self, now: Instant) {
         self.stale_until.set(now + STALE);
     }
@@ -78,8 +77,7 @@ impl PortTx {
         self.sleeps.get()
     }
 
-    /// Whether the port's owner discards data read now, since it may have waited while the process
-    /// slept.
+    /// Whether the port's owner discards data read now because it may have waited while the process slept.
     pub(super) fn is_stale(&self) -> bool {
         self.stale_until.get() != Instant::ZERO && now() < self.stale_until.get()
     }
@@ -118,56 +116,56 @@ impl PortTx {
     }
 }
 
-/// Data that waited while the process slept. A peer's system may hold megabytes for a connection,
-/// more than can be read while the port's owner discards it; and on a busy machine a device's task may not run
-/// before the owner accepts input again.
+/// Data that waited while the process slept. A peer's kernel may hold megabytes for a connection, more than can be read
+/// while the port's owner discards input. On a busy machine, a device's task may not run before the owner accepts input
+/// again.
 #[derive(Debug)]
 pub(super) struct Backlog {
-    /// The newest sleep after which was seen whether something waited.
+    /// The newest sleep after which the device was checked for waiting data.
     known: u32,
-    /// Something waited after it, and was not read yet.
+    /// Data was waiting at that check and has not been read yet.
     waits: bool,
-    /// There was more than could be read in that time.
+    /// There was more data than could be read while the owner discarded it.
     is_behind: bool,
-    /// Since when there was no more than could be read at once.
+    /// Since when each read has returned less than its maximum.
     small_since: Option<Instant>,
 }
 
 impl Backlog {
-    /// Nothing waits in the device now.
+    /// A device in which no data waits.
     pub(super) fn new(tx: &PortTx) -> Self {
         Self { known: tx.sleeps.get(), waits: false, is_behind: false, small_since: None }
     }
 
-    /// A new connection, for which was waited since [`PortTx::sleeps`] was `known`. What came while the process slept may
-    /// wait in it, unless that was long ago.
+    /// A new connection. `known` is [`PortTx::sleeps`] when waiting for it began. Data that came while the process
+    /// slept may wait in it, unless that was long ago.
     pub(super) fn accepted(tx: &PortTx, known: u32) -> Self {
         let is_long_ago = now().saturating_since(tx.stale_until.get()) >= MAX_BACKLOG;
         Self { known: if is_long_ago { tx.sleeps.get() } else { known }, ..Self::new(tx) }
     }
 
-    /// Whether the process slept, and nobody has seen since then if something waits in the device.
+    /// Whether the process slept and the device has not been checked for waiting data since.
     pub(super) fn has_slept(&self, tx: &PortTx) -> bool {
         self.known != tx.sleeps.get()
     }
 
-    /// Whether something waits in the device after the newest sleep.
+    /// Records whether data waits in the device after the newest sleep.
     pub(super) fn note(&mut self, tx: &PortTx, waits: bool) {
         (self.known, self.waits) = (tx.sleeps.get(), waits);
     }
 
-    /// Whether data read now may be part of it: then it may be read in larger pieces.
+    /// Whether data read now may belong to the backlog and so may be read in larger pieces.
     pub(super) fn is_open(&self, tx: &PortTx) -> bool {
         self.is_behind || self.waits || tx.is_stale()
     }
 
-    /// Whether data just read is part of it and not discarded by the port's owner. `is_more` if
-    /// there was more than was read.
+    /// Whether data just read belongs to the backlog and the port's owner does not discard it. `is_more`: there was
+    /// more than was read.
     pub(super) fn has(&mut self, tx: &PortTx, is_more: bool) -> bool {
         let waited = self.waits || self.has_slept(tx);
         self.waits &= is_more;
         if tx.is_stale() {
-            // Once there was more, a pause does not tell that it was all.
+            // Once there was more, a pause does not show that the backlog is over.
             self.is_behind |= is_more;
             self.small_since = None;
             return false;
@@ -179,13 +177,13 @@ impl Backlog {
             return false;
         }
         let now = now();
-        // A peer's system may pause before it sends more of it.
+        // A peer's kernel may pause before it sends more of the backlog.
         let since = *self.small_since.get_or_insert(now);
         if is_more {
             self.small_since = None;
         }
         let is_over = !is_more && now.saturating_since(since) >= PAUSE;
-        // A peer that never pauses is read again after some time.
+        // Data of a peer that never pauses counts as new after some time.
         self.is_behind = !is_over && now.saturating_since(tx.stale_until.get()) < MAX_BACKLOG;
         self.is_behind
     }
@@ -204,9 +202,9 @@ pub struct DeviceCounters {
     pub frames_out: u64,
     /// Bytes sent while no client was connected.
     pub unheard: u64,
-    /// Bytes that a client did not read in time, whole frames sent while the queue was full, and
-    /// data that waited while the process slept and was read too late for the engine to discard it, or
-    /// while one gateway took the place of another.
+    /// Bytes that a client did not read in time, whole frames sent while the queue was full, and old data: it waited
+    /// while the process slept and was read too late for the engine to discard it, or while one gateway replaced
+    /// another.
     pub dropped: u64,
     /// Clients refused because there was one already, or too many.
     pub refused: u64,
@@ -227,24 +225,24 @@ pub struct DeviceCounters {
     /// The newest transmit error counter of a CAN controller.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tx_error_counter: Option<u8>,
-    /// Its receive error counter.
+    /// The newest receive error counter of a CAN controller.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rx_error_counter: Option<u8>,
-    /// CAN FD frames, which no recipe takes.
+    /// CAN FD frames, which no recipe uses.
     pub fd_frames: u64,
     /// A CAN controller's error state, where it is known: active, warning, passive or bus-off.
     #[serde(skip_serializing_if = "str::is_empty")]
     pub bus: &'static str,
 }
 
-/// The minimum time for which the engine discards input after sleep.
+/// Minimum time for which the engine discards input after sleep.
 pub const STALE: Duration = Duration::from_millis(50);
-/// A backlog ends after this long with less data than can be read at once: systems may pause within
-/// one. The engine's links are not up earlier.
+/// A backlog ends after this long with less data than can be read at once: systems may pause within a backlog. The
+/// engine's links are not up earlier.
 const PAUSE: Duration = Duration::from_millis(100);
 /// A longer backlog counts as new data after this.
 const MAX_BACKLOG: Duration = Duration::from_secs(10);
-/// A frame of every port's recipe fits several times; a port waits for one to leave.
+/// Room for several frames of any port's recipe; a port sends the next frame only after the last one has left.
 const MAX_QUEUED_BYTES: usize = 4_096;
-/// Twice the maximum number of ids in a recipe's part.
+/// Twice the maximum number of ids in a part of a recipe.
 const MAX_QUEUED_FRAMES: usize = 64;

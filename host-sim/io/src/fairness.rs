@@ -1,5 +1,5 @@
-//! Fair scheduling of the tasks on a runtime's thread: a peer that sends without end must delay neither the
-//! others nor the engine's deadlines.
+//! Fair scheduling of the tasks on a runtime's thread: a peer that sends without end must delay neither other tasks nor
+//! the engine's deadlines.
 
 use std::cell::Cell;
 use std::future::poll_fn;
@@ -17,13 +17,13 @@ thread_local! {
     static TURN: Rc<Semaphore> = Rc::new(Semaphore::new(1));
     /// Number of tasks in [`yield_fairly`].
     static WAITING: Cell<usize> = const { Cell::new(0) };
-    /// The next deadline of the engine whose tasks run now.
+    /// The next deadline of the engine whose task is running.
     static DEADLINE: Cell<Instant> = const { Cell::new(Instant::NEVER) };
 }
 
-/// Yields, for a task that has more to do at once. tokio polls sockets and timers and runs all other tasks
-/// before this returns, and only one of the tasks that wait here continues each time. So a deadline waits for
-/// one busy task at most, however many there are.
+/// Yields, for a task that has more to do at once. tokio polls sockets and timers and runs all other tasks before this
+/// returns, and only one of the tasks that wait here continues each time. A deadline thus waits for at most one busy
+/// task, however many there are.
 pub async fn yield_fairly() {
     let _waiting = WaitingTask::new();
     let turn = TURN.with(Rc::clone);
@@ -31,7 +31,7 @@ pub async fn yield_fairly() {
     yield_now().await;
 }
 
-/// Lets the tasks run first that can run now. Unlike a yield of tokio's, it polls neither sockets nor timers.
+/// Lets all tasks that are ready run first. Unlike tokio's yield, it polls neither sockets nor timers.
 pub async fn give_way() {
     let mut has_given = false;
     poll_fn(|cx| {
@@ -63,8 +63,8 @@ pub enum Order {
     RightFirst,
 }
 
-/// Waits for one of two in an order that may be another one each time, so that neither has to wait for ever. The other one is
-/// dropped. Cancel safe if both are.
+/// Waits for one of two futures and drops the other. The order may change from call to call, so neither starves. Cancel
+/// safe if both are.
 pub async fn either<L, R>(
     left: impl Future<Output = L>,
     right: impl Future<Output = R>,
@@ -90,7 +90,7 @@ pub async fn either<L, R>(
     .await
 }
 
-/// Whether a task waits in [`yield_fairly`], because it has more to do at once.
+/// Whether a task waits in [`yield_fairly`].
 pub fn is_anyone_busy() -> bool {
     WAITING.get() > 0
 }
@@ -110,14 +110,14 @@ impl Drop for WaitingTask {
     }
 }
 
-/// Sets the next deadline of the engine to which the task that runs belongs, for [`let_others_run`] and
-/// [`arrival_time`]: that of the work around it ([`apart`]), else of this thread.
+/// Sets the next deadline of the engine to which the running task belongs, for [`let_others_run`] and [`arrival_time`].
+/// The deadline is that of the surrounding [`apart`], or else of this thread.
 pub fn set_deadline(deadline: Instant) {
     DEADLINE.set(deadline);
 }
 
-/// Gives an engine and the tasks around it a deadline of their own, where several share a thread. All tasks have to be
-/// polled within `work`, as those of a [`LocalSet`](tokio::task::LocalSet) are that it runs.
+/// Gives an engine and its tasks a deadline of their own where several engines share a thread. All tasks must be polled
+/// within `work`, as those of a [`LocalSet`](tokio::task::LocalSet) that it runs are.
 pub async fn apart<F: Future>(work: F) -> F::Output {
     let mut work = pin!(work);
     let mut own = Instant::NEVER;
@@ -132,9 +132,9 @@ pub async fn apart<F: Future>(work: F) -> F::Output {
 
 /// Lets all other tasks report input that had arrived by the deadline, before the engine handles it.
 ///
-/// tokio polls the sockets before a task that has yielded continues, and runs each task that has input once.
-/// That is enough if the deadline is kept. If the thread was blocked, more input may wait than a task reads
-/// at once: then this waits until all of it is read, for a bounded time, because there may be no end of it.
+/// tokio polls the sockets before a task that has yielded continues, and runs each task that has input once. That is
+/// enough if the deadline is kept. If the thread was blocked, more input may wait than a task reads at once: then this
+/// waits until all of it is read, but only for a bounded time, because the input may be endless.
 pub async fn let_others_run() {
     yield_now().await;
     let mut before = now();
@@ -142,7 +142,7 @@ pub async fn let_others_run() {
         return;
     }
     let (mut spent, mut idle_rounds) = (Duration::ZERO, 0);
-    // Two, because a task may have passed input on to another one.
+    // Two, because a task may have passed input on to another task.
     while idle_rounds < 2 && spent < MAX_CATCH_UP {
         yield_now().await;
         let round = now().saturating_since(before);
@@ -154,8 +154,8 @@ pub async fn let_others_run() {
     }
 }
 
-/// The latest time at which input that is read now can count as arrived: now, or its engine's deadline if the
-/// thread was blocked when it passed.
+/// The latest time at which input that is read now can have arrived: now, or its engine's deadline if the thread was
+/// blocked at the deadline.
 pub fn arrival_time() -> Instant {
     let now = now();
     missed_deadline(now).unwrap_or(now)
@@ -166,7 +166,7 @@ fn missed_deadline(now: Instant) -> Option<Instant> {
     (now.saturating_since(deadline) >= BLOCKED).then_some(deadline)
 }
 
-/// A deadline missed by this much means that the thread was blocked: the other tasks take less.
+/// A deadline missed by this much means that the thread was blocked: other tasks take less time.
 const BLOCKED: Duration = Duration::from_millis(5);
 /// How long [`let_others_run`] waits for late input, without the time for which the thread was blocked.
 const MAX_CATCH_UP: Duration = Duration::from_millis(20);

@@ -29,7 +29,7 @@ impl Beside {
             let nth = NEXT.fetch_add(1, Relaxed);
             let name = place.with_file_name(format!(".host-sim-{}-{nth}", std::process::id()));
             match make(&name) {
-                // Left by a run that was killed.
+                // Left by a killed run.
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists && left > 0 => left -= 1,
                 made => return made.map(|made| (Self { name, moved: false }, made)),
             }
@@ -52,10 +52,10 @@ impl Beside {
         &self.name
     }
 
-    /// Moves it to `place`, where nothing may exist.
+    /// Moves the file to `place`, where nothing may exist.
     ///
     /// # Errors
-    /// [`io::ErrorKind::AlreadyExists`] if something does.
+    /// [`io::ErrorKind::AlreadyExists`] if something exists.
     pub fn put_new(mut self, place: &Path) -> io::Result<()> {
         match renameat_with(CWD, &self.name, CWD, place, RenameFlags::NOREPLACE) {
             // Not every file system can check and rename in one step.
@@ -71,10 +71,10 @@ impl Beside {
         Ok(())
     }
 
-    /// Moves it to `place` and replaces the file or link there.
+    /// Moves the file to `place` and replaces the file or link there.
     ///
     /// # Errors
-    /// If it cannot be moved, such as to the path of a folder.
+    /// If the file cannot be moved, such as to the path of a folder.
     pub fn replace(mut self, place: &Path) -> io::Result<()> {
         fs::rename(&self.name, place)?;
         self.moved = true;
@@ -90,15 +90,15 @@ impl Drop for Beside {
     }
 }
 
-/// Reads a file that is its owner's alone, such as a key; at most `max` bytes of it.
+/// Reads at most `max` bytes of a file that only its owner may access, such as a key.
 ///
 /// # Errors
-/// If it is no regular file, others may read or write it, it cannot be read or is no UTF-8. No error repeats what is in
-/// it.
+/// If it is not a regular file, others may read or write it, it cannot be read, or is not UTF-8. No error repeats its
+/// contents.
 pub fn read_private(path: &Path, max: u64) -> io::Result<String> {
     use std::os::unix::fs::MetadataExt;
     let file = fs::File::open(path)?;
-    // Of the file that was opened, whatever is at its path by now.
+    // Check the opened file: its path may lead to another file by now.
     let metadata = file.metadata()?;
     if !metadata.is_file() {
         return Err(io::Error::other("not a regular file"));
@@ -112,8 +112,8 @@ pub fn read_private(path: &Path, max: u64) -> io::Result<String> {
     Ok(text)
 }
 
-/// The identity of a file or link. One that was deleted and created again is another one, as long as the
-/// first is open or linked elsewhere.
+/// The identity of a file or link. A file that was deleted and created again has another identity, as long as the first
+/// is open or linked elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Identity {
     device: u64,
@@ -129,7 +129,7 @@ impl Identity {
 }
 
 static NEXT: AtomicU32 = AtomicU32::new(0);
-/// Names to try: a killed process may have had our process id and left files.
+/// Maximum number of names to try: a killed process may have had the same process id and left files.
 const MAX_NAMES: u32 = 100;
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Handover of open devices: a gateway that is replaced passes its pseudoterminals and listening sockets to its
 //! successor, so that clients stay connected.
 //!
-//! In: what the tasks of a port used, after they have ended. Out: the same device in another runtime, for a port with
+//! In: the open descriptors of a port whose tasks have ended. Out: the same device in another runtime, for a port with
 //! the same name, `--bind` and kind of bus. The new owner drops input that arrived in between.
 
 use std::cell::RefCell;

@@ -1,4 +1,4 @@
-//! What the tasks of one thread do I/O with: the devices that a configured port can be bound to (pseudoterminals, serial
+//! I/O for the tasks of one thread: the devices that a configured port can be bound to (pseudoterminals, serial
 //! devices, byte streams over TCP, a CAN bus in user space, CAN interfaces of the kernel), sockets, timers and
 //! scheduling.
 //!

@@ -13,7 +13,7 @@ pub struct LogLimit {
 }
 
 impl LogLimit {
-    /// `Some` if a line may be logged now, with the number of lines suppressed since the last one.
+    /// `Some` if a line may be logged now, with the number of lines suppressed since the last logged line.
     pub fn allow(&self, now: Instant) -> Option<u64> {
         if now.saturating_since(self.interval_start.get()) >= INTERVAL {
             self.interval_start.set(now);

@@ -1,4 +1,4 @@
-//! The device of one port, of any kind: opened as `--bind` says, driven by one task, used through a handle.
+//! The device of a port, of any kind: opened as `--bind` says, driven by one task, used through a handle.
 //!
 //! The task reports events of the device as [`PortEvent`]s. The port's owner sends through [`PortTx`], which
 //! never waits: its queue is bounded.
@@ -54,8 +54,8 @@ impl OpenPort {
         Self::open_or_adopt(device, bus, None).await
     }
 
-    /// As [`Self::open`], but takes over the previous owner's device if it matches: clients stay connected, and what
-    /// they sent in between is dropped. Otherwise that device is closed first.
+    /// As [`Self::open`], but takes over the previous owner's device if it matches: clients stay connected, and input
+    /// from before the takeover is dropped. A device that does not match is closed first.
     pub async fn open_or_adopt(
         device: &Device,
         bus: BusSettings,
@@ -88,8 +88,8 @@ impl OpenPort {
         self.is_handed_over
     }
 
-    /// Allows the device to be handed over after the tasks of [`Self::run`] have ended; `None` if the device is not
-    /// handed over: it has no clients, or opening it again costs nothing.
+    /// Allows the device to be handed over after the tasks of [`Self::run`] have ended; `None` if the device has no
+    /// clients, or costs nothing to open again.
     pub fn hold(&self) -> Option<Hold> {
         let held = match &self.driver {
             PortDriver::Serial(serial) => serial.held()?,
@@ -109,16 +109,16 @@ impl OpenPort {
         }
     }
 
-    /// Sets the CAN ids that are used in either direction. A CAN interface of the kernel then reports no
-    /// others; other devices report all frames, and so does an interface before this call.
+    /// Sets the CAN ids that are used in either direction. A CAN interface of the kernel then reports no other ids;
+    /// other devices report all frames, as does an interface before this call.
     pub fn listen_to(&mut self, ids: Vec<CanId>) {
         if let PortDriver::Kernel(can) = &mut self.driver {
             can.listen_to(ids);
         }
     }
 
-    /// Lets transmissions take their time on this clock, not on the machine's. Without effect on a CAN
-    /// interface of the kernel.
+    /// Lets transmissions take their time on this clock instead of the machine's. Without effect on a CAN interface of
+    /// the kernel.
     #[must_use]
     pub fn on_clock(mut self, clock: &Clock) -> Self {
         match &mut self.driver {
@@ -129,7 +129,7 @@ impl OpenPort {
         self
     }
 
-    /// Whether the kernel says when something has left, not the clock of [`Self::on_clock`].
+    /// Whether the kernel, and not the clock of [`Self::on_clock`], decides when a frame has left.
     pub fn is_kernel_can(&self) -> bool {
         matches!(self.driver, PortDriver::Kernel(_))
     }
@@ -142,7 +142,7 @@ impl OpenPort {
     /// Runs the device until the future is dropped, which closes it.
     ///
     /// # Errors
-    /// Only if the device fails permanently; otherwise this waits until it is back.
+    /// If the device fails permanently; a device that comes back is waited for.
     pub async fn run(self, events: impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         let tx = Rc::clone(&self.tx);
         let ended = match self.driver {

@@ -1,7 +1,7 @@
 //! A pseudoterminal with a symbolic link: a serial line that any program can open.
 //!
-//! The terminal side is kept open here too, so that the line survives its clients and the reactor never sees
-//! a hang-up. Bytes that no client reads are lost, as on a line, and not kept for the next client.
+//! This process keeps the terminal side open too, so the line survives its clients and the reactor never sees a
+//! hang-up. Bytes that no client reads are lost, as on a line, and not kept for the next client.
 
 use std::cell::{Cell, RefCell};
 use std::io;
@@ -23,7 +23,7 @@ use crate::reactor::register;
 /// One pseudoterminal. For a current-thread runtime: see [`Pty::has_client`].
 #[derive(Debug)]
 pub(crate) struct Pty {
-    // Dropped first, so that the link never leads to a terminal that is gone.
+    // Dropped first: the link must never lead to a terminal that is gone.
     link: Symlink,
     master: AsyncFd<OwnedFd>,
     // `None` only if a client opened the terminal exclusively during `has_client`.
@@ -43,7 +43,7 @@ pub(crate) struct HandoverPty {
 }
 
 impl HandoverPty {
-    /// Registers it with the current tokio runtime.
+    /// Registers the terminal with the current tokio runtime.
     pub(crate) fn attach(self) -> io::Result<Pty> {
         let Self { link, master, terminal, unread } = self;
         let master = register(master, Interest::READABLE)?;
@@ -52,8 +52,8 @@ impl HandoverPty {
 }
 
 impl Pty {
-    /// Detaches it from its runtime; clients notice nothing. Closes it and returns `None` if a client has
-    /// opened the terminal exclusively at this moment.
+    /// Detaches the terminal from its runtime; clients notice nothing. Closes it and returns `None` if a client has
+    /// opened it exclusively at this moment.
     pub(crate) fn detach(self) -> Option<HandoverPty> {
         self.reopen();
         let Self { link, master, terminal, unread } = self;
@@ -64,12 +64,11 @@ impl Pty {
     /// Opens a new pseudoterminal in raw mode, with a symbolic link to it at `link`, in the current tokio
     /// runtime.
     ///
-    /// An existing link is replaced if it leads to a pseudoterminal and the program that made it is gone.
-    /// Anything else there stays.
+    /// An existing link is replaced if it leads to a pseudoterminal of a program that is gone. Anything else stays.
     ///
     /// # Errors
-    /// With the path in the message: the link's folder cannot be created, something else is there, or the
-    /// system has no pseudoterminal left.
+    /// With the path in the message: the link's folder cannot be created, something else is at the path, or the system
+    /// has no pseudoterminal left.
     pub(crate) fn open(link: &Path) -> io::Result<Self> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = openpt(flags)?;
@@ -111,13 +110,13 @@ impl ByteStream for Pty {
         read_ready(|| self.readable(), || self.try_read(buf)).await
     }
 
-    /// After less than `buf` holds, `receive` waits for more.
+    /// If `buf` is not filled, `receive` waits for more.
     fn try_read(&self, buf: &mut [u8]) -> io::Result<usize> {
-        // Whatever readiness the reactor knows: it has not polled a new descriptor yet.
+        // Ignores the reactor's readiness: it has not polled a new descriptor yet.
         let read = rustix::io::read(self.master.get_ref(), &mut *buf);
         if match read {
-            // A terminal returns all that has arrived; what comes later makes it readable again. Another read would wait
-            // for the kernel's thread that still passes on these bytes.
+            // A terminal returns everything that has arrived, and later bytes make it readable again. Another read
+            // would wait for the kernel's thread that still passes on these bytes.
             Ok(count) => count > 0 && count < buf.len(),
             Err(error) => error == Errno::AGAIN,
         } {
@@ -133,15 +132,15 @@ impl ByteStream for Pty {
     }
 
     async fn writable(&self) -> io::Result<()> {
-        // Of its own, for the rare client that does not read: the other one would wake this thread for each read of a
-        // client.
+        // A separate descriptor for the rare client that does not read: on the other one, each read of a client would
+        // wake this thread.
         let master =
             register(rustix::io::fcntl_dupfd_cloexec(self.master.get_ref(), 0)?, Interest::WRITABLE)?;
         master.writable().await?.retain_ready();
         Ok(())
     }
 
-    /// Without a check that there is a client.
+    /// Does not check that there is a client.
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         self.unread.set(true);
         Ok(rustix::io::write(self.master.get_ref(), bytes)?)
@@ -151,20 +150,20 @@ impl ByteStream for Pty {
         ioctl_fionread(self.master.get_ref()) != Ok(0)
     }
 
-    /// Also those that the kernel has not made readable yet.
+    /// Includes bytes that the kernel has not made readable yet.
     fn discard_unread(&self) {
         // Fails only if no client can have written anything.
         let _ = tcflush(self.master.get_ref(), QueueSelector::IFlush);
     }
 
-    /// Whether a client has the terminal open now. If not, bytes that the last one left unread are dropped
-    /// and raw mode is restored.
+    /// Whether a client has the terminal open now. If not, drops bytes that the last client left unread and restores
+    /// raw mode.
     ///
-    /// The only way to find out is to close our own terminal side for an instant and look for a hang-up. Only
-    /// the thread that polls this runtime's reactor may do this, or the reactor would see the hang-up.
+    /// The only way to find out is to close this process's terminal side for an instant and look for a hang-up. Only
+    /// the thread that polls this runtime's reactor may do this; otherwise the reactor would see the hang-up.
     fn has_client(&self) -> bool {
         if let Some(terminal) = self.terminal.take() {
-            // A client's exclusive lock would prevent us from opening it again.
+            // A client's exclusive lock would prevent this process from opening it again.
             let _ = ioctl_tiocnxcl(&terminal);
         }
         let mut fds = [PollFd::new(self.master.get_ref(), PollFlags::empty())];

@@ -1,4 +1,4 @@
-//! Random bytes of the kernel, for keys and seeds.
+//! Random bytes from the kernel, for keys and seeds.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -6,7 +6,7 @@ use std::io::{self, Read};
 /// `N` cryptographically random bytes.
 ///
 /// # Errors
-/// If the kernel's source cannot be read, as in a root folder without `/dev`.
+/// If the kernel's source cannot be read, as in a chroot without `/dev`.
 pub fn random<const N: usize>() -> io::Result<[u8; N]> {
     let mut bytes = [0; N];
     let read = File::open(SOURCE).and_then(|mut source| source.read_exact(&mut bytes));

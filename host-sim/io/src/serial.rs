@@ -30,11 +30,11 @@ use crate::tty::Tty;
 #[derive(Debug)]
 pub(super) struct SerialPort {
     source: SerialSource,
-    /// Another owner had it before, and something may wait in it.
+    /// The device was taken over, and old input may wait in it.
     is_handed_over: bool,
     settings: Rs485,
     tx: Rc<PortTx>,
-    /// The clock of the line: when its last bit has left.
+    /// The clock that determines when the last bit has left the line.
     pub(super) clock: Clock,
 }
 
@@ -96,7 +96,6 @@ impl SerialPort {
         }
     }
 
-    /// What clients are connected to.
     pub(super) fn held(&self) -> Option<Held> {
         match &self.source {
             SerialSource::Pty(pty, _) => Some(Held::Pty(Rc::clone(pty))),
@@ -217,7 +216,7 @@ async fn pump<D: ByteStream>(
     events: &mut impl FnMut(PortEvent<'_>),
 ) -> io::Error {
     let mut buf = vec![0; BACKLOG_CHUNK];
-    // Nothing is asked before a frame, unless what came last was one too: a line that never pauses would be all there is.
+    // Input goes first, unless it went first the last time too: a line that never pauses would starve the rest.
     let mut order = Order::LeftFirst;
     loop {
         if backlog.has_slept(&sender.tx) {
@@ -231,8 +230,8 @@ async fn pump<D: ByteStream>(
             Either::Left(Ok(count)) => {
                 let is_full = count == most;
                 take(&buf[..count], is_full, &sender.tx, &mut backlog, events);
-                // A device that never pauses must not delay other tasks. Bytes that the engine discards
-                // take little time, and must be read before it accepts input again.
+                // A device that never pauses must not delay other tasks. Bytes that the engine discards take little
+                // time, and must be read before it accepts input again.
                 let is_much = is_full && !sender.tx.is_stale();
                 if is_much {
                     yield_fairly().await
@@ -258,13 +257,13 @@ async fn pump<D: ByteStream>(
     }
 }
 
-/// What a port waits for, other than bytes.
+/// What a port waits for besides bytes.
 enum Other {
     Slept,
     /// Received bytes are requested from the driver.
     Looked,
     HandedOver,
-    /// The transmission can go on.
+    /// The transmission can continue.
     Due(io::Result<()>),
     /// A client may have gone and left bytes unread.
     MayHaveGone,
@@ -281,8 +280,8 @@ async fn other<D: ByteStream>(device: &D, sender: &Sender) -> Other {
     }
 }
 
-/// Reads and drops what clients sent while nobody read: its age is unknown. That takes [`STALE`](super::exchange::STALE), and longer
-/// while there is more than can be read at once, as after sleep.
+/// Reads and drops input from before the takeover, whose age is unknown. That takes [`STALE`](super::exchange::STALE),
+/// and longer while there is more than can be read at once, as after sleep.
 async fn drain(device: &impl ByteStream, tx: &PortTx) -> io::Result<()> {
     let mut buf = vec![0; BACKLOG_CHUNK];
     let mut backlog = Backlog::new(tx);
@@ -313,8 +312,8 @@ async fn drain(device: &impl ByteStream, tx: &PortTx) -> io::Result<()> {
     Ok(())
 }
 
-/// Reports bytes just read, or drops them if they may have waited while the process slept and the engine does not
-/// discard them any more.
+/// Reports bytes just read, or drops them if they may have waited while the process slept and the engine no longer
+/// discards them.
 fn take(
     bytes: &[u8],
     is_full: bool,
@@ -330,7 +329,7 @@ fn take(
     }
 }
 
-/// Reports what can be read now.
+/// Reports what can be read at once.
 fn look(
     device: &impl ByteStream,
     tx: &PortTx,
@@ -351,8 +350,8 @@ fn look(
     }
 }
 
-/// Reads what waited while the process slept, so that the engine counts and discards it, and drops the
-/// rest: the kernel makes a terminal's bytes readable in pieces, some of them later.
+/// Reads what waited while the process slept, so that the engine counts and discards it, and drops the rest: the kernel
+/// makes a terminal's bytes readable in pieces, some of them later.
 fn discard_backlog(
     device: &impl ByteStream,
     tx: &PortTx,
@@ -365,7 +364,7 @@ fn discard_backlog(
         take(&buf[..count], count == buf.len(), tx, backlog, events);
     }
     device.discard_unread();
-    // The runtime may not know yet what the system has.
+    // The runtime may not know yet what the kernel holds.
     backlog.note(tx, device.has_unread());
 }
 
@@ -408,7 +407,7 @@ impl Sender {
     fn down(&mut self, events: &mut impl FnMut(PortEvent<'_>)) {
         self.sending = false;
         self.blocked = false;
-        // Disarming cannot fail. A stale deadline would keep a stepped clock from moving.
+        // Disarming cannot fail. A stale deadline would stop a stepped clock.
         let _ = self.timer.arm(Instant::NEVER);
         events(PortEvent::Down);
     }
@@ -501,7 +500,7 @@ fn bytes_in(settings: &Rs485, time: Duration) -> usize {
 const CHUNK: usize = 512;
 /// The same for bytes that waited while the process slept.
 const BACKLOG_CHUNK: usize = 16 * 1_024;
-/// Interval at which a drained device is looked at while nothing comes.
+/// Interval of checks of a drained device while nothing arrives.
 const DRAIN_LOOK: StdDuration = StdDuration::from_millis(10);
 /// Maximum number of reads after a sleep before other tasks run.
 const MAX_BACKLOG_READS: usize = 64;
@@ -511,7 +510,7 @@ const DELIVERY: StdDuration = StdDuration::from_secs(1);
 const MIN_WRITE_INTERVAL: Duration = Duration::from_micros(500);
 /// Interval at which a serial device's output buffer is checked.
 const DRAIN_POLL: Duration = Duration::from_micros(200);
-/// Interval at which is checked whether a client has gone and left bytes unread.
+/// Interval of checks whether a client has gone and left bytes unread.
 const CLIENT_POLL: StdDuration = StdDuration::from_millis(100);
 
 #[cfg(test)]

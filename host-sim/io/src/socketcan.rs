@@ -3,8 +3,8 @@
 //! In: frames to send, in order. Out: received frames, the interface's error state, and whether it exists.
 //! Does not know recipes; the port's owner sets the ids to receive.
 //!
-//! A frame counts as sent when the kernel echoes it, which the interface's driver does after the frame was on
-//! the bus. So, if no node acknowledges, one cycle's frames wait and not a queue of old ones.
+//! A frame counts as sent when the kernel echoes it, which the interface's driver does after the frame was on the bus.
+//! If no node acknowledges, only one cycle's frames wait and not a queue of old ones.
 
 mod error_frame;
 mod interface;
@@ -43,7 +43,7 @@ pub(super) struct KernelCan {
 
 impl KernelCan {
     pub(super) fn open(interface: &str, bitrate: u32, tx: Rc<PortTx>) -> io::Result<Self> {
-        // Only to report errors at once; the interface may still be down.
+        // Only to report errors early; the interface may still be down.
         match CanFdSocket::open(interface) {
             Ok(_) => Ok(Self { interface: interface.to_owned(), bitrate, ids: None, tx }),
             Err(error) => {
@@ -113,13 +113,13 @@ struct Attached<'a> {
     passive_log: LogLimit,
     /// Frames that the kernel accepted and has not echoed.
     in_flight: usize,
-    /// [`Self::lost`] when the kernel accepted the first of them.
+    /// [`Self::lost`] when the kernel accepted the first frame in flight.
     lost_at_send: u32,
     /// Since when the kernel has refused the next frame.
     refused_since: Option<Instant>,
     /// Frames that the kernel dropped on this socket.
     lost: u32,
-    /// When to call [`Self::check`], if something is waited for.
+    /// When to call [`Self::check`]; never if nothing is pending.
     check_at: Instant,
     backlog: Backlog,
     /// Interval of checks of an interface that is bus-off.
@@ -136,7 +136,7 @@ impl<'a> Attached<'a> {
         }
         socket.set_error_filter_accept_all()?;
         socket.set_recv_own_msgs(true)?;
-        // As much as the system allows; the kernel drops and counts the rest.
+        // As large as the system allows; beyond it the kernel drops and counts frames.
         let (level, forced) = (libc::SOL_SOCKET, libc::SO_RCVBUFFORCE);
         if socket.set_socket_option_int(level, forced, RECEIVE_BUFFER).is_err() {
             let _ = socket.set_socket_option_int(level, libc::SO_RCVBUF, RECEIVE_BUFFER);
@@ -145,7 +145,7 @@ impl<'a> Attached<'a> {
         if let Some(error) = socket.as_raw_socket().take_error()? {
             return Err(error);
         }
-        // Not those of the controller before.
+        // Forget the counters of the previous controller.
         port.tx.count(|counters| (counters.tx_error_counter, counters.rx_error_counter) = (None, None));
         Ok(Self {
             port,
@@ -184,8 +184,8 @@ impl<'a> Attached<'a> {
             }
             let mut more = MoreData::No;
             let done = tokio::select! {
-                // The crate's own async socket waits for data only, and so would not notice that the
-                // interface went down: that is an error of the socket, without data.
+                // The crate's own async socket waits only for data. It would miss that the interface went down, which
+                // is an error of the socket without data.
                 ready = ready.ready(Interest::READABLE | Interest::ERROR) => ready.and_then(|mut ready| {
                     more = self.receive_some(events)?;
                     if more == MoreData::No {
@@ -222,8 +222,8 @@ impl<'a> Attached<'a> {
         Ok(MoreData::Maybe)
     }
 
-    /// Reads all that can have waited while the process slept, so that the engine counts and discards it. What it
-    /// would not discard any more is dropped.
+    /// Reads everything that can have waited while the process slept, so that the engine counts and discards it. Drops
+    /// what the engine no longer discards.
     fn discard_backlog(&mut self, events: &mut impl FnMut(PortEvent<'_>)) -> io::Result<()> {
         for _ in 0..MAX_WAITING {
             match message::receive(self.socket.as_fd()) {
@@ -249,7 +249,7 @@ impl<'a> Attached<'a> {
                     counters.frames_in += 1;
                     counters.bytes_in += frame.data().len() as u64;
                 });
-                // A node that receives is not bus-off. Adapters with old firmware report it in no other way.
+                // A node that receives is not bus-off. Adapters with old firmware report the recovery in no other way.
                 if self.is_off() && !message.is_local && Interface::of(&self.port.interface).has_carrier {
                     self.enter_state(BusState::Active, events);
                 }
@@ -313,7 +313,7 @@ impl<'a> Attached<'a> {
         if state == BusState::BusOff {
             self.bus_off_polls.reset();
             self.check_at = now() + pause(self.bus_off_polls.pause());
-            // Frames in flight will not be sent, or too late.
+            // Frames in flight will be sent too late or never.
             self.in_flight = 0;
             self.drop_queue();
         }
@@ -407,7 +407,7 @@ impl<'a> Attached<'a> {
         self.check_at = now() + ECHO_TIMEOUT;
         self.count_lost()?;
         if self.in_flight > 0 && self.lost != self.lost_at_send {
-            // Their echoes may be among the lost messages.
+            // The lost messages may include their echoes.
             self.in_flight = 0;
             return self.continue_sending(events);
         }
@@ -455,8 +455,8 @@ fn kernel_frame(frame: &CanFrame) -> io::Result<socketcan::CanFrame> {
     made.ok_or_else(|| io::ErrorKind::InvalidInput.into())
 }
 
-/// Whether the queue of the interface (ENOBUFS) or of the socket (EAGAIN) is full. The kernel does not report
-/// when the former has room again.
+/// Whether the queue of the interface (ENOBUFS) or of the socket (EAGAIN) is full. The kernel does not report when the
+/// interface's queue has room again.
 fn is_full(error: &io::Error) -> bool {
     matches!(error.raw_os_error(), Some(libc::ENOBUFS | libc::EAGAIN | libc::EINTR))
 }
@@ -480,7 +480,7 @@ const ECHO_TIMEOUT: Duration = Duration::from_millis(20);
 const BATCH: usize = 64;
 /// Bytes: half a second of a full bus at 500 kbit/s. Without privileges the system allows a fifth of it.
 const RECEIVE_BUFFER: i32 = 1_024 * 1_024;
-/// More frames than that buffer holds: for each the kernel counts more than this.
+/// More frames than that buffer holds: the kernel counts more bytes than this for each.
 const MAX_WAITING: usize = RECEIVE_BUFFER as usize / 128;
 /// Length of SO_MEMINFO: nine numbers, the last of which counts dropped messages.
 const MEMINFO_LEN: usize = 9 * 4;

@@ -1,5 +1,5 @@
-//! The byte stream of a serial port or an slcan client: a pseudoterminal, a serial device or a TCP
-//! connection; and how TCP clients are accepted.
+//! The byte stream of a serial port or an slcan client: a pseudoterminal, a serial device or a TCP connection. Also
+//! accepts TCP clients.
 
 use std::io;
 use std::time::Duration as StdDuration;
@@ -14,7 +14,7 @@ use crate::tcp_options;
 use crate::timer::now;
 use crate::tty::Tty;
 
-/// A connected device or client: what differs between the three kinds.
+/// A connected device or client of any of the three kinds.
 pub(super) trait ByteStream {
     /// Whether bytes that cannot be written at once are lost, as on a line, instead of waiting.
     const LOSSY: bool;
@@ -27,8 +27,8 @@ pub(super) trait ByteStream {
     async fn writable(&self) -> io::Result<()>;
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize>;
 
-    /// Whether the system holds bytes that were not read, also if the runtime does not know of them yet; so if the
-    /// system does not say.
+    /// Whether the system holds unread bytes, even if the runtime does not know of them yet; `true` if the system does
+    /// not say.
     fn has_unread(&self) -> bool;
 
     /// Drops bytes that have arrived and were not read, if the system can.
@@ -44,8 +44,7 @@ pub(super) trait ByteStream {
         true
     }
 
-    /// Whether a client may have left bytes unread: then `has_client` must be called at times, because it
-    /// drops them.
+    /// Whether a client may have left bytes unread. If so, `has_client` must be called from time to time to drop them.
     fn may_hold_unread(&self) -> bool {
         false
     }
@@ -99,7 +98,7 @@ impl ByteStream for TcpStream {
     }
 }
 
-/// Reads as soon as there is something. Cancel safe, as `readable` is.
+/// Reads as soon as bytes are available. Cancel safe, as `readable` is.
 pub(super) async fn read_ready(
     readable: impl AsyncFn() -> io::Result<()>,
     mut try_read: impl FnMut() -> io::Result<usize>,
@@ -113,8 +112,8 @@ pub(super) async fn read_ready(
     }
 }
 
-/// Listens at `at`, with limited buffers for each client: what waits in the kernel becomes old, and nothing
-/// counts it.
+/// Listens at `at`, with limited buffers for each client: data that waits in the kernel becomes old, and nothing counts
+/// it.
 pub(super) async fn listen(at: &HostPort) -> io::Result<TcpListener> {
     let listener = TcpListener::bind((at.host.as_str(), at.port)).await;
     let listener = listener.map_err(|error| io::Error::new(error.kind(), format!("{at}: {error}")))?;
@@ -132,7 +131,7 @@ pub(super) fn peer_of(stream: &TcpStream) -> String {
     stream.peer_addr().map_or_else(|_| String::new(), |at| at.to_string())
 }
 
-/// Accepts one client. Errors of the system, such as too few descriptors, are waited out.
+/// Accepts one client. Waits out errors of the system, such as too few descriptors.
 pub(super) async fn accept(listener: &TcpListener, tx: &PortTx) -> (TcpStream, std::net::SocketAddr) {
     let failed = |error: &io::Error| {
         tx.count(|counters| counters.accept_failures += 1);

@@ -1,9 +1,9 @@
 //! The symbolic link by which other programs find a pseudoterminal.
 //!
-//! A link belongs to the process that created it, as long as that runs. The process holds a lock on a file
-//! beside the link, `.NAME.lock`, which the kernel releases however the process ends. The file says which
-//! link was created: so a link left by a killed run is distinguished from one still in use, even if another
-//! program has the terminal's number now.
+//! A link belongs to the process that created it, as long as that process runs. The process holds a lock on a file
+//! beside the link, `.NAME.lock`, which the kernel releases however the process ends. The file says which link was
+//! created. This distinguishes a link left by a killed run from a link still in use, even if another program has the
+//! terminal's number now.
 
 use std::fs;
 use std::io::{self, Read, Seek, Write};
@@ -27,8 +27,8 @@ impl Symlink {
     /// Creates a link to `target` at `path`, and the folder if it does not exist.
     ///
     /// # Errors
-    /// With the path in the message: the folder cannot be created, or there is something else at the path
-    /// than a link that is no longer in use.
+    /// With the path in the message: the folder cannot be created, or the path holds something other than a link that
+    /// is no longer in use.
     pub(super) fn create(path: &Path, target: &Path) -> io::Result<Self> {
         let create = || -> io::Result<Self> {
             path.parent().map_or(Ok(()), fs::create_dir_all)?;
@@ -60,8 +60,8 @@ impl Drop for Symlink {
     }
 }
 
-/// Whether nothing is at `path`; `false` for a link that may be replaced, an error for anything else. `left`
-/// is the link that the last run left here.
+/// Whether nothing is at `path`; `false` for a link that may be replaced, an error for anything else. `left` is the
+/// link that the last run left there.
 fn is_free(path: &Path, left: Option<Made>) -> io::Result<bool> {
     let refused = |message: String| Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
     let found = match fs::symlink_metadata(path) {
@@ -141,8 +141,7 @@ impl Lock {
         Err(in_use(None))
     }
 
-    /// Records the identity of the link before it is moved to its place, so that there is never an unknown
-    /// one.
+    /// Records the identity of the link before the link is moved to its place, so no link is ever unknown.
     fn record(&mut self, made: Made) -> io::Result<()> {
         let record = LinkRecord { process: std::process::id(), made };
         self.file.rewind()?;
@@ -153,7 +152,7 @@ impl Lock {
 
 impl Drop for Lock {
     fn drop(&mut self) {
-        // While the lock is held: the next holder creates a new file.
+        // Removed while the lock is held: the next holder creates a new file.
         let _ = fs::remove_file(&self.path);
     }
 }
@@ -175,7 +174,7 @@ fn in_use(holder: Option<LinkRecord>) -> io::Error {
     io::Error::new(io::ErrorKind::ResourceBusy, message)
 }
 
-/// The content of a lock's file: the holder, and the link that it created.
+/// The content of a lock file: the holder, and the link that it created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct LinkRecord {
     process: u32,
@@ -198,7 +197,7 @@ impl LinkRecord {
     }
 }
 
-/// The identity of a link. A link is never modified, so another time means another link.
+/// The identity of a link. A link is never modified, so a different time means a different link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Made {
     inode: u64,

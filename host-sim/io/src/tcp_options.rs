@@ -1,5 +1,4 @@
-//! Socket options of TCP connections: buffer sizes, detection of a lost peer, and how much the peer has
-//! acknowledged.
+//! Socket options of TCP connections: buffer sizes, detection of a lost peer, and how much the peer has acknowledged.
 
 use std::io;
 use std::net::SocketAddr;
@@ -11,7 +10,7 @@ use tokio::net::{TcpListener, TcpStream};
 
 /// Limits the system's buffers of each connection that a listening socket accepts, in both directions.
 pub fn limit_buffers(listener: &TcpListener) {
-    // Accepted connections inherit the sizes. A system that refuses has limits of its own.
+    // Accepted connections inherit the sizes. A system that refuses them has limits of its own.
     let _ = sockopt::set_socket_recv_buffer_size(listener, BUFFER);
     let _ = sockopt::set_socket_send_buffer_size(listener, BUFFER);
 }
@@ -54,23 +53,24 @@ pub fn clear_user_timeout(stream: &TcpStream) {
     set_user_timeout(stream, Duration::ZERO);
 }
 
-/// What is sent arrives within this time, or never: the connection ends, and what waits is dropped. As
-/// [`enable_keepalive`] otherwise.
+/// As [`enable_keepalive`], and sent data arrives within this time or never: the connection ends, and waiting data is
+/// dropped.
 pub fn deliver_in_time(stream: &TcpStream, timeout: Duration) {
     enable_keepalive(stream);
-    // What waits in the system becomes old.
+    // Data that waits in the system becomes old.
     let _ = sockopt::set_socket_send_buffer_size(stream, BUFFER);
     let _ = reset_on_close(stream);
     set_user_timeout(stream, timeout);
 }
 
-/// However the connection ends from now on, even with this process, it is reset: data that the peer has not
-/// received by then is dropped.
+/// From now on the connection is reset however it ends, even if this process dies: data that the peer has not received
+/// by then is dropped.
 pub fn reset_on_close(stream: &TcpStream) -> io::Result<()> {
     stream.set_zero_linger()
 }
 
-/// Number of written bytes that the peer has not acknowledged (SIOCOUTQ); of a terminal, that have not left (TIOCOUTQ).
+/// Number of written bytes that the peer has not acknowledged (SIOCOUTQ) or, on a terminal, that have not left
+/// (TIOCOUTQ).
 pub fn unacknowledged(stream: impl AsFd) -> io::Result<usize> {
     let mut count: libc::c_int = 0;
     // SAFETY: the descriptor is open while it is borrowed; the call writes one int to `count`, which
@@ -82,13 +82,13 @@ pub fn unacknowledged(stream: impl AsFd) -> io::Result<usize> {
     Ok(usize::try_from(count).unwrap_or(0))
 }
 
-/// Time after which a listening socket is tried again.
+/// Pause after a failed accept.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(50);
-/// Bytes in each direction.
+/// Buffer size in bytes in each direction.
 const BUFFER: usize = 64 * 1_024;
-/// Silence before the first keepalive probe, and time between two.
+/// Silence before the first keepalive probe, and time between two probes.
 const PROBE_INTERVAL: Duration = Duration::from_secs(5);
-/// Probes without an answer after which the peer is lost.
+/// Number of unanswered probes after which the peer is lost.
 const MAX_PROBES: u32 = 3;
 /// Silence after which a peer is lost.
 #[cfg(test)]

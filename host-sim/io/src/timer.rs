@@ -1,10 +1,9 @@
 //! The clock and its timers: CLOCK_BOOTTIME in microseconds, and `timerfd`s on absolute times.
 //!
-//! CLOCK_BOOTTIME continues while the machine is suspended, so that the age of waiting data is right after
-//! it.
+//! CLOCK_BOOTTIME continues while the machine is suspended, so the age of waiting data is right after it.
 //!
-//! tokio's own timers have a resolution of 1 ms and fire later than that; a `timerfd` in the same reactor is
-//! late by tens of microseconds, which a grid of 4 ms needs.
+//! tokio's own timers have a resolution of 1 ms and fire later than that. A `timerfd` in the same reactor is late by
+//! tens of microseconds, which a grid of 4 ms needs.
 
 use std::cell::Cell;
 use std::io;
@@ -51,7 +50,7 @@ impl Timer {
         self.armed.get()
     }
 
-    /// Moves the deadline. One in the past expires at once; [`Instant::NEVER`] disarms the timer.
+    /// Moves the deadline. A past deadline expires at once; [`Instant::NEVER`] disarms the timer.
     pub fn arm(&self, deadline: Instant) -> io::Result<()> {
         if deadline == self.armed.get() {
             return Ok(());
@@ -80,7 +79,7 @@ impl Timer {
                 self.armed.set(Instant::NEVER);
                 return Ok(());
             }
-            // That of an earlier deadline, unless two clocks of the kernel disagree.
+            // An expiration of an earlier deadline, unless two clocks of the kernel disagree.
             match ready.try_io(|fd| Ok(rustix::io::read(fd.get_ref(), &mut [0; 8])?)) {
                 Ok(Ok(_)) if self.armed.get() != Instant::NEVER => {
                     self.armed.set(Instant::NEVER);

@@ -1,6 +1,6 @@
-//! A serial device of this host: opened for this program alone, raw, with the rate and the format of a line.
+//! A serial device of this host: opened exclusively and raw, with the rate and the format of a line.
 //!
-//! In and out: bytes. Does not know when a byte has left the line, except that the system still holds it.
+//! In and out: bytes. Does not know when a byte has left the line, only whether the system still holds it.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -26,10 +26,10 @@ pub(crate) struct Tty {
 }
 
 impl Tty {
-    /// Opens it in the current tokio runtime.
+    /// Opens the device in the current tokio runtime.
     ///
     /// # Errors
-    /// If there is no such device, another program has it, or it refuses the settings.
+    /// If the device does not exist, another program has it, or it refuses the settings.
     pub(crate) fn open(path: &str, settings: Rs485) -> io::Result<Self> {
         match Self::open_with(path, settings) {
             // A pseudoterminal has no parity bit; some systems refuse one instead of ignoring it.
@@ -43,10 +43,10 @@ impl Tty {
     }
 
     fn open_with(path: &str, settings: Rs485) -> io::Result<Self> {
-        // Non-blocking also because the open would wait for a carrier.
+        // Non-blocking also because a blocking open would wait for a carrier.
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let fd = open(path, flags, Mode::empty())?;
-        // The first one keeps out all but root; the second one those that ask for it.
+        // TIOCEXCL keeps out everybody but root; the lock keeps out programs that check for it.
         ioctl_tiocexcl(&fd)?;
         let device = Self { fd: register(fd, Interest::READABLE)? };
         flock(device.fd.get_ref(), FlockOperation::NonBlockingLockExclusive).map_err(
@@ -67,7 +67,7 @@ impl Tty {
         termios.control_modes |= ControlModes::CREAD | ControlModes::CLOCAL;
         termios.make_raw();
         tcsetattr(fd, OptionalActions::Now, &termios)?;
-        // It does not fail as long as one of the settings is applied.
+        // tcsetattr succeeds if at least one of the settings is applied.
         let applied = tcgetattr(fd)?;
         let modes = |termios: &Termios| {
             (termios.input_modes, termios.output_modes, termios.control_modes, termios.local_modes)
@@ -108,7 +108,7 @@ impl Tty {
         Ok(rustix::io::read(&self.fd, buf)?)
     }
 
-    /// Writes what the system takes.
+    /// Writes as much as the system accepts.
     ///
     /// # Errors
     /// [`io::ErrorKind::WouldBlock`] if its buffer is full.
@@ -116,7 +116,7 @@ impl Tty {
         Ok(rustix::io::write(&self.fd, bytes)?)
     }
 
-    /// Whether bytes can be read; so if the system does not say.
+    /// Whether bytes can be read; `true` if the system does not say.
     pub(crate) fn has_unread(&self) -> bool {
         ioctl_fionread(&self.fd) != Ok(0)
     }
@@ -127,7 +127,7 @@ impl Tty {
         let _ = tcflush(&self.fd, QueueSelector::IFlush);
     }
 
-    /// Whether written bytes have not left; not so if the system does not say.
+    /// Whether written bytes have not left yet; `false` if the system does not say.
     pub(crate) fn is_draining(&self) -> bool {
         unacknowledged(&self.fd).is_ok_and(|left| left > 0)
     }
@@ -135,7 +135,7 @@ impl Tty {
 
 impl Drop for Tty {
     fn drop(&mut self) {
-        // Or a terminal that others have open would stay locked.
+        // Otherwise a terminal that others have open would stay locked.
         let _ = ioctl_tiocnxcl(&self.fd);
     }
 }

@@ -12,13 +12,13 @@ use proto_core::wire::can::{CanFrame, CanId};
 /// How long frames take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Pacing {
-    /// None at all: a frame is transmitted as soon as it is queued.
+    /// No time: a frame is transmitted as soon as it is queued.
     AtOnce,
     /// As long as their bits take at this rate, in bit/s.
     Bitrate(u32),
 }
 
-/// A node of the bus; one that joined later is greater.
+/// A node of the bus. A node that joined later is greater.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct NodeId(u64);
 
@@ -31,7 +31,7 @@ pub(crate) struct Transmitted {
     pub(crate) at: Instant,
 }
 
-/// The node has [`MAX_QUEUED`] frames waiting already; the frame was not queued.
+/// The node already has [`MAX_QUEUED`] waiting frames; the frame was not queued.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Full;
 
@@ -101,7 +101,7 @@ impl Wire {
         queue.push_back(QueuedFrame { since: now, frame });
         match self.in_progress {
             None => self.arbitrate(),
-            // Still within the first bit of that frame, so this one takes part in the arbitration.
+            // Still within the first bit of that frame: the new frame takes part in the arbitration.
             Some(first) if now <= first.start + self.bit_time() => {
                 if let Some(queue) = self.nodes.get_mut(&first.from) {
                     queue.push_front(first.what);
@@ -119,8 +119,8 @@ impl Wire {
         self.in_progress.map_or(Instant::NEVER, |frame| frame.end)
     }
 
-    /// The next frame that has ended by now. A late call changes nothing: the following frame began at this
-    /// one's end, with arbitration among the nodes that had one queued by then.
+    /// The next frame that has ended by now. A late call changes nothing: the following frame began at the end of this
+    /// frame, after an arbitration among the nodes that had a frame queued by then.
     pub(crate) fn poll(&mut self, now: Instant) -> Option<Transmitted> {
         let InProgress { from, what, end, .. } = self.in_progress.take_if(|frame| frame.end <= now)?;
         self.free_since = end;
@@ -128,8 +128,8 @@ impl Wire {
         Some(Transmitted { from, frame: what.frame, at: end })
     }
 
-    /// Starts the frame with the lowest arbitration field, of those queued when the bus became idle, or of
-    /// the first one after that.
+    /// Starts the frame with the lowest arbitration field among those queued when the bus became idle, or the first
+    /// frame queued after that.
     fn arbitrate(&mut self) {
         let heads = || self.nodes.iter().filter_map(|(&node, queue)| queue.front().map(|&what| (node, what)));
         let Some(first) = heads().map(|(_, what)| what.since).min() else { return };
@@ -157,8 +157,8 @@ impl Wire {
     }
 }
 
-/// A frame's arbitration field as a number: the lowest wins. A standard frame wins over an extended one with
-/// the same leading 11 bits, and a data frame over a remote one.
+/// A frame's arbitration field as a number: the lowest wins. A standard frame wins over an extended frame with the same
+/// leading 11 bits, and a data frame over a remote frame.
 pub(crate) fn arbitration_field(frame: &CanFrame) -> u32 {
     let remote = u32::from(frame.is_remote());
     match frame.id() {

@@ -1,4 +1,4 @@
-//! slcan clients of a bus: what they say to it and hear of it, on TCP and on a terminal.
+//! slcan clients of a bus, over TCP and on a terminal: their commands, and the frames that they receive.
 
 use std::cell::RefCell;
 use std::io;
@@ -30,7 +30,7 @@ pub(crate) type Clients = RefCell<Vec<Rc<SlcanClient>>>;
 #[derive(Debug)]
 pub(crate) struct SlcanSession {
     channel: Channel,
-    /// What the client has not taken yet.
+    /// Bytes that the client has not read yet.
     out: Vec<u8>,
     /// Received frames that wait for space on the bus.
     rest: Vec<u8>,
@@ -42,7 +42,7 @@ impl SlcanSession {
     }
 }
 
-/// Serves clients on TCP: those that were taken over, and those that come.
+/// Serves clients over TCP: those that were taken over, and new ones.
 pub(super) async fn serve_all(
     listener: &TcpListener,
     clients: &Rc<Clients>,
@@ -117,7 +117,7 @@ pub(super) async fn serve<D: ByteStream>(
 ) -> io::Error {
     node.set_receiving(false);
     {
-        // What a client that was taken over had sent before, and what its channel was.
+        // Earlier input and the channel's state of a client that was taken over.
         let SlcanSession { channel, out, rest } = &mut *session.borrow_mut();
         let (rest, mut unread) = (std::mem::take(rest), 0..rest.len());
         execute_commands(channel, node, Some(tx), &rest, &mut unread, out);
@@ -131,8 +131,8 @@ pub(super) async fn serve<D: ByteStream>(
             backlog.note(tx, io.has_unread());
             is_old |= !unread.is_empty();
         }
-        // A frame waits in the bounded queue until the client has read what is before it, and a command until
-        // the frames before it have been transmitted.
+        // A frame waits in the bounded queue until the client has read all output before it. A command waits until the
+        // frames before it have been transmitted.
         let room = session.borrow().out.len() < MAX_PENDING;
         let most = if backlog.is_open(tx) { BACKLOG_CHUNK } else { CHUNK };
         let mut read = None;
@@ -143,7 +143,7 @@ pub(super) async fn serve<D: ByteStream>(
                     Ok(count) => {
                         unread = 0..count;
                         read = Some(count);
-                        // Dropped here: after its time on the bus the engine would no longer discard it.
+                        // Drop it here: after its time on the bus, the engine would no longer discard it.
                         is_old = backlog.has(tx, count == most) || tx.is_stale();
                         Ok(())
                     }
@@ -197,8 +197,7 @@ pub(super) async fn serve<D: ByteStream>(
     }
 }
 
-/// Executes a client's commands as long as the node has room for their frames. Old frames are dropped and
-/// counted.
+/// Executes a client's commands as long as the node has room for their frames. Drops and counts old frames.
 fn execute_commands(
     channel: &mut Channel,
     node: &BusNode,
@@ -207,7 +206,7 @@ fn execute_commands(
     unread: &mut Range<usize>,
     out: &mut Vec<u8>,
 ) {
-    // A clock that stands cannot be late.
+    // A clock that does not run by itself is never late.
     let is_real = !node.bus.shared.clock.runs_apart();
     let arrived = if is_real { arrival_time() } else { node.bus.now() };
     while !Range::is_empty(unread) && !node.is_full() {
@@ -231,7 +230,7 @@ fn execute_commands(
     }
 }
 
-/// Writes as much as the client takes; without a client everything is dropped and counted.
+/// Writes as much as the client accepts. Without a client everything is dropped and counted.
 fn flush(io: &impl ByteStream, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()> {
     if !io.has_client() {
         tx.count(|counters| counters.unheard += out.len() as u64);
@@ -246,10 +245,10 @@ fn flush(io: &impl ByteStream, out: &mut Vec<u8>, tx: &PortTx) -> io::Result<()>
 
 pub(super) const MAX_CLIENTS: usize = 32;
 const CHUNK: usize = 256;
-/// The same for bytes that waited while the process slept, whose frames are dropped. A terminal with more
-/// waiting returns exactly this number.
+/// Maximum number of bytes per read for bytes that waited while the process slept, whose frames are dropped. A terminal
+/// with more waiting returns exactly this number.
 const BACKLOG_CHUNK: usize = 4_095;
 /// Maximum number of bytes that wait for a client; beyond it frames wait in the node's queue.
 const MAX_PENDING: usize = 4_096;
-/// Interval at which is checked whether a client has gone and left bytes unread.
+/// Interval of checks whether a client has gone and left bytes unread.
 const CLIENT_POLL: StdDuration = StdDuration::from_millis(100);

@@ -13,7 +13,7 @@ pub(super) enum StateChange {
     Other,
 }
 
-/// The state in an error frame. The worst one counts: a frame may contain the states of both directions.
+/// The state in an error frame, which may contain the states of both directions: the worst one counts.
 pub(super) fn state_change(frame: CanErrorFrame) -> StateChange {
     let error = frame.into_error();
     if error.is_bus_off() {

@@ -3,8 +3,8 @@
 //! In: an interface's name, or the kernel's answer as bytes. Out: whether it has a carrier, and the bit rate
 //! and the error state that its driver knows. Does not know error frames. No privileges are needed.
 //!
-//! Bus-off needs both carrier and state: some drivers switch the carrier off and know no state; `gs_usb`
-//! keeps the carrier and knows the last state that its adapter reported.
+//! Bus-off needs both carrier and state: some drivers switch the carrier off and report no state; `gs_usb` keeps the
+//! carrier and reports the last state of its adapter.
 
 use std::io;
 
@@ -35,7 +35,7 @@ impl Interface {
             .ok_or_else(|| io::Error::other("not told of the interface"))
     }
 
-    /// As [`Self::query`]; if that fails, an interface without errors.
+    /// As [`Self::query`]; an interface without errors if the query fails.
     pub(super) fn of(interface: &str) -> Self {
         Self::query(interface).unwrap_or(Self { has_carrier: true, bitrate: None, state: None })
     }
@@ -110,7 +110,7 @@ fn word(bytes: &[u8]) -> Option<u32> {
     bytes.first_chunk().map(|bytes| u32::from_ne_bytes(*bytes))
 }
 
-/// Length of `struct nlmsghdr`: length, kind, flags, and two words that are not used here.
+/// Length of `struct nlmsghdr`: length, kind, flags, and two unused words.
 const NLMSGHDR: usize = 16;
 /// Length of `struct ifinfomsg`, which is zero in a request.
 const IFINFOMSG: usize = 16;
@@ -123,7 +123,7 @@ const FLAGS: u16 = 0xC000;
 /// IFLA_CAN_BITTIMING: a structure that begins with the bit rate.
 const CAN_BIT_TIMING: u16 = 1;
 const CAN_STATE: u16 = 4;
-/// Maximum length of an answer; one about an interface has about 2 KiB.
+/// Maximum length of a reply; a reply about an interface has about 2 KiB.
 const MAX_ANSWER: usize = 16 * 1_024;
 
 #[cfg(test)]

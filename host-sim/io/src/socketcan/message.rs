@@ -1,6 +1,6 @@
-//! One message of a CAN_RAW socket: a frame, and whether it is our own.
+//! One message of a CAN_RAW socket: a frame, and whether this socket sent it.
 //!
-//! The `socketcan` crate does not report the flag that marks the echo of an own frame.
+//! The `socketcan` crate does not report the flag that marks the echo of a sent frame.
 
 use std::io;
 use std::mem::{size_of_val, zeroed};
@@ -12,7 +12,7 @@ use socketcan::CanErrorFrame;
 #[derive(Debug)]
 pub(super) struct CanMessage {
     pub(super) content: Content,
-    /// The echo of an own frame, which was sent.
+    /// The echo of a frame that this socket has sent.
     pub(super) is_own: bool,
     /// The frame was sent by a program on this machine, whether or not it got onto the bus.
     pub(super) is_local: bool,
