@@ -1,4 +1,4 @@
-//! Bytes in words, and where they are among others.
+//! Bytes as text, and their places among other bytes.
 
 use std::fmt;
 
@@ -36,7 +36,7 @@ pub(crate) fn is_at(bytes: &[u8], at: usize, what: &[u8]) -> bool {
     bytes.get(at..).is_some_and(|rest| rest.starts_with(what))
 }
 
-/// The most frequent item, and how often it comes; the first of several.
+/// The most frequent item, the first of several, and how often it occurs.
 pub(crate) fn most<T: PartialEq>(items: impl IntoIterator<Item = T>) -> Option<(T, usize)> {
     let mut counts: Vec<(T, usize)> = Vec::new();
     for item in items {

@@ -9,7 +9,7 @@ use crate::finding::{Cause, Finding, Severity};
 use crate::port_case::PortCase;
 use crate::record::SeenId;
 
-/// Looks at the bus and at what came on it.
+/// Examines the bus and its frames.
 pub(crate) fn examine(seen: &PortCase<'_>, state: BusState, findings: &mut Vec<Finding>) {
     match state {
         BusState::BusOff => {
@@ -78,7 +78,7 @@ fn words(ids: &[CanId]) -> String {
     format!("{}{more}", shown.join(", "))
 }
 
-/// Ids that nobody knows, the most frequent first.
+/// Ids that no recipe has, the most frequent first.
 fn ids(seen: &PortCase<'_>, mut foreign: Vec<&SeenId>, recipe_ids: &[CanId]) -> Finding {
     foreign.sort_by_key(|one| std::cmp::Reverse(one.count()));
     let shown: Vec<_> =
@@ -92,7 +92,7 @@ fn ids(seen: &PortCase<'_>, mut foreign: Vec<&SeenId>, recipe_ids: &[CanId]) -> 
     )
 }
 
-/// The same number as an id of the other kind.
+/// An id with the number of one in a recipe but of the other kind.
 fn other_kind<'a>(foreign: &[&'a SeenId], recipe_ids: &[CanId]) -> Option<(&'a SeenId, CanId)> {
     let number = |id: CanId| match id {
         CanId::Standard(id) => u32::from(id),

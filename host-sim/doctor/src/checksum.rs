@@ -1,4 +1,4 @@
-//! Checksums that would be right: another algorithm, byte order, or range.
+//! Checksums that fit the frames: another algorithm, byte order, or range.
 
 use proto_core::config::{DeviceFrame, FieldSpec};
 use proto_core::device::{Algorithm, ByteOrder, Carrier, Checksum, Probe};
@@ -6,10 +6,10 @@ use proto_core::sysvar::Direction;
 
 use crate::shape::Shape;
 
-/// A checksum with which frames are right, in words, such as `crc16-modbus, high byte first`.
+/// A checksum that fits the frames, in words, such as `crc16-modbus, high byte first`.
 ///
-/// `bytes` are searched at every place, or are one whole frame where something else than the fields ends
-/// frames. Several frames must agree, or one if a chance is remote.
+/// `bytes` are searched at every place, or are one whole frame if something other than the fields ends frames. Several
+/// frames must agree, or only one if a match by chance is unlikely.
 pub(crate) fn right_one(shape: &Shape<'_>, bytes: &[u8]) -> Option<String> {
     let (_, fields, carrier) = shape.device.as_ref()?;
     let own = fields.iter().find_map(|field| match field {
@@ -19,7 +19,7 @@ pub(crate) fn right_one(shape: &Shape<'_>, bytes: &[u8]) -> Option<String> {
     let mut best: Option<(usize, String)> = None;
     for name in Algorithm::names() {
         let Some(algorithm) = Algorithm::named(name) else { continue };
-        // Another length is another frame, which has a finding of its own.
+        // Another length means another frame, which has a finding of its own.
         if algorithm.len() != own.algorithm.len() {
             continue;
         }
@@ -30,7 +30,7 @@ pub(crate) fn right_one(shape: &Shape<'_>, bytes: &[u8]) -> Option<String> {
                     continue;
                 }
                 let right = count(&sum, shape, fields, *carrier, bytes);
-                // One byte is right by chance once in 256.
+                // One byte matches by chance once in 256.
                 let needed = if own.algorithm.len() == 1 { 3 } else { 1 };
                 if right >= needed && best.as_ref().is_none_or(|(most, _)| right > *most) {
                     best = Some((right, words(name, order, range, own.algorithm.len())));
@@ -41,7 +41,7 @@ pub(crate) fn right_one(shape: &Shape<'_>, bytes: &[u8]) -> Option<String> {
     best.map(|(_, words)| words)
 }
 
-/// First bytes that a checksum may cover: as configured, with the head, behind it.
+/// First bytes that a checksum may cover: as configured, the first of the head, the one after the head, the second one.
 fn ranges(own: &Checksum, head: usize) -> Vec<(u16, &'static str)> {
     let mut ranges = vec![(own.first, "")];
     for (first, words) in [
@@ -65,7 +65,7 @@ fn words(name: &str, order: ByteOrder, range: &str, len: usize) -> String {
     format!("{name}{order}{range}")
 }
 
-/// Number of frames that are right with this checksum.
+/// Number of frames for which this checksum is right.
 fn count(sum: &Checksum, shape: &Shape<'_>, fields: &[FieldSpec], carrier: Carrier, bytes: &[u8]) -> usize {
     let replaced: Vec<FieldSpec> = fields
         .iter()

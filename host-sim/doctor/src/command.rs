@@ -1,9 +1,9 @@
-//! What findings about commands have in common.
+//! Shared by findings about commands.
 
 use proto_core::config::{FieldSpec, InputBinding};
 use proto_core::time::Duration;
 
-/// ` 12 s ago`, behind what was then.
+/// ` 12 s ago`, to append to an event.
 pub(crate) fn ago(age: Duration) -> String {
     format!(" {} s ago", age.as_millis() / 1000)
 }

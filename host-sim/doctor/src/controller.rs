@@ -11,7 +11,7 @@ use crate::finding::{Cause, Finding, FindingPlace, Severity};
 use crate::record::PortRecord;
 use crate::state::ObservedPort;
 
-/// Looks at the newest command of each port, and at the controller.
+/// Examines the newest command of each port, and the controller.
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     for port in &case.status.ports {
         findings.extend(command(case, port));
@@ -40,7 +40,7 @@ pub fn has_commands(config: ConfigView<'_>) -> bool {
     config.fields.iter().any(is_command)
 }
 
-/// The newest command of a port, if something became of it that was not meant.
+/// The newest command of a port, if it did not have the intended effect.
 fn command(case: &Case<'_>, port: &ObservedPort) -> Option<Finding> {
     let place = FindingPlace::Port(port.name.clone());
     let given = port.command.clone().unwrap_or_else(|| "a command".to_owned());
@@ -125,7 +125,7 @@ fn failed(case: &Case<'_>, port: &ObservedPort, place: &FindingPlace) -> Option<
         let likely = "The controller refuses what is so already, such as a stop while nothing runs";
         return found(Severity::Note, Cause::NothingToDo, refused(why), likely, "Nothing is to be done");
     }
-    // Power on is what a powered-off arm needs.
+    // `poweron` is the right command for an arm without power.
     let is_cure = |cause: Cause| match cause {
         Cause::PowerOff => word == "poweron",
         Cause::Disabled => word == "enable",
@@ -168,7 +168,7 @@ fn failed(case: &Case<'_>, port: &ObservedPort, place: &FindingPlace) -> Option<
     }
 }
 
-/// Why the command has nothing to do: the controller is already what it asks for.
+/// Why the command has nothing to do: the controller is already in the requested state.
 fn is_so_already(word: &str, states: &States) -> Option<&'static str> {
     match (word, states.program, states.robot) {
         ("stop" | "pause", ProgramState::Stopped, _) => Some("no program runs"),
@@ -192,7 +192,7 @@ fn mode(mode: OperationMode) -> &'static str {
     }
 }
 
-/// What a controller in these states refuses commands for.
+/// Why a controller in these states refuses commands.
 fn refusal(states: &States) -> Option<(Cause, String, &'static str, &'static str)> {
     if states.mode == OperationMode::Manual {
         return Some((
@@ -203,7 +203,7 @@ fn refusal(states: &States) -> Option<(Cause, String, &'static str, &'static str
         ));
     }
     match states.safety {
-        // Without power there is nothing to watch: the robot's own state says it better.
+        // Without power no safety function is active; the robot's own state is more precise.
         SafetyState::Run | SafetyState::Reduce | SafetyState::PowerOff => {}
         SafetyState::Stop0 | SafetyState::Stop1 | SafetyState::Stop2 => {
             return Some((

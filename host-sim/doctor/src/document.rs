@@ -1,8 +1,8 @@
-//! The document `status` of the API, read back: what a gateway elsewhere says of itself.
+//! Reads the document `status` of the API: what another gateway reports of itself.
 //!
-//! In: the document, and the configuration that the gateway runs. Out: a [`State`], as an engine there would give it.
-//! What the document does not have comes from the configuration: where a link goes, which port has which number.
-//! What neither has is unknown; a port or link that the configuration does not have is left out.
+//! In: the document, and the configuration that the gateway runs. Out: a [`State`], as an engine there would report it.
+//! The configuration supplies what the document does not have: where a link leads, and the numbers of ports. What
+//! neither has is unknown. Ports and links that the configuration does not have are left out.
 
 use std::collections::BTreeMap;
 
@@ -121,7 +121,7 @@ struct CodeDocument {
 }
 
 impl StatusDocument {
-    /// The counters of each port of the configuration, to be noted in its record.
+    /// The counters of each port of the configuration, for its record.
     pub fn counters<'a>(
         &'a self,
         config: &'a GatewayConfig,
@@ -132,7 +132,7 @@ impl StatusDocument {
         })
     }
 
-    /// The links that are up, with how often they came up.
+    /// The links that are up, and how often each has come up.
     pub fn links_up(&self) -> impl Iterator<Item = (&str, u32)> {
         self.links
             .iter()
@@ -140,7 +140,7 @@ impl StatusDocument {
             .map(|(name, link)| (&**name, link.history.connects))
     }
 
-    /// What the gateway says. `up_for` is asked how long a link that is up has been so, as far as that is known.
+    /// The reported state. `up_for` returns how long a link has been up, if known.
     pub fn state(
         &self,
         config: &GatewayConfig,
@@ -152,7 +152,7 @@ impl StatusDocument {
             Some(self.ports.get(name)?.port(PortId(index), name, &port.bus))
         });
         let ports = ports.collect();
-        // An engine knows which links a configuration needs, and where they go.
+        // An engine knows which links a configuration needs, and where they lead.
         let engine = Box::new(Engine::<MAX_PORTS>::new(config)?);
         let links = engine.links().filter_map(|info| {
             let shown = self.links.get(info.name)?;
@@ -239,14 +239,14 @@ fn reply(name: &str) -> ReplyCode {
     all.into_iter().find(|code| code.name() == name).unwrap_or_default()
 }
 
-/// The reason of this name; `None` if it is one that this program does not know.
+/// The reason with this name; `None` if this program does not know it.
 fn named<'de, T: Deserialize<'de>>(name: &'de str) -> Option<T> {
     let name: StrDeserializer<'de, Error> = name.into_deserializer();
     T::deserialize(name).ok()
 }
 
 impl RejectionDocument {
-    /// `None` if the reason is one that this program does not know.
+    /// `None` if this program does not know the reason.
     fn rejected(&self) -> Option<Rejected> {
         let (why, age) = (named(&self.why)?, Duration::from_millis(self.age_ms));
         Some(Rejected { why, age, len: self.len, bytes: from_hex(&self.bytes)? })
@@ -255,7 +255,7 @@ impl RejectionDocument {
 
 impl ControllerDocument {
     fn states(&self) -> States {
-        // The codes are those of the newest version of the controller, whichever it is.
+        // The codes are those of the controller's newest version, whatever its version is.
         States {
             mode: OperationMode::from_code(self.mode.code),
             robot: RobotState::from_code(self.robot.code),

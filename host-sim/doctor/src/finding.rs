@@ -1,20 +1,20 @@
-//! One finding, and its words.
+//! One finding and its texts.
 
 use std::fmt;
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
-/// Stands for the gateway's file in the commands of a remedy: only who has started the doctor knows its name.
+/// Stands for the gateway's file in the commands of a remedy: only the caller of the doctor knows the file's name.
 pub const FILE: &str = "FILE";
 
 /// How much a finding matters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
-    /// Nothing may be wrong: something could not be seen.
+    /// Something could not be observed; nothing may be wrong.
     Note,
-    /// It may be meant so: a device that has not spoken yet.
+    /// It may be intended, such as a device that has not sent yet.
     Warning,
-    /// It cannot work like this.
+    /// It cannot work this way.
     Fault,
 }
 
@@ -52,7 +52,7 @@ impl fmt::Display for FindingPlace {
 
 macro_rules! causes {
     ($($(#[$doc:meta])* $variant:ident = $name:literal,)*) => {
-        /// The likely cause, for programs; people read the words.
+        /// The likely cause, for programs; people read the text.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
         #[non_exhaustive]
         pub enum Cause {
@@ -60,10 +60,10 @@ macro_rules! causes {
         }
 
         impl Cause {
-            /// All of them.
+            /// All causes.
             pub const ALL: &[Self] = &[$(Self::$variant),*];
 
-            /// Its name in JSON, such as `head_swapped`.
+            /// The name in JSON, such as `head_swapped`.
             pub const fn name(self) -> &'static str {
                 match self {
                     $(Self::$variant => $name,)*
@@ -74,11 +74,11 @@ macro_rules! causes {
 }
 
 causes! {
-    /// The port's device is not there.
+    /// The port's device does not exist.
     DeviceGone = "device_gone",
     /// Nothing arrives.
     NoBytes = "no_bytes",
-    /// Bytes arrive, and no frame begins in them: baud rate, parity, or another protocol.
+    /// Bytes arrive but no frame begins in them: baud rate, parity, or another protocol.
     NoHead = "no_head",
     /// The head's bytes come in the other order.
     HeadSwapped = "head_swapped",
@@ -90,21 +90,21 @@ causes! {
     TailDiffers = "tail_differs",
     /// Frames have another number of bytes.
     LengthDiffers = "length_differs",
-    /// Frames begin and break off.
+    /// Frames begin but are incomplete.
     BrokenOff = "broken_off",
-    /// Numbers make sense in the other byte order only.
+    /// Numbers are only plausible in the other byte order.
     ByteOrder = "byte_order",
-    /// The checksum is right when it is computed otherwise.
+    /// The checksum is right when computed in another way.
     ChecksumKind = "checksum_kind",
-    /// The checksum is wrong, however it is computed.
+    /// The checksum is wrong with every known algorithm.
     ChecksumWrong = "checksum_wrong",
-    /// Frames are those of another device.
+    /// The frames belong to another device.
     OtherDevice = "other_device",
     /// A field is not a number, or its value does not fit.
     BadValue = "bad_value",
-    /// The device's counter stands still.
+    /// The device's counter does not change.
     Frozen = "frozen",
-    /// Bytes arrive, and the recipe has no input part.
+    /// Bytes arrive but the recipe has no input part.
     NoInput = "no_input",
     /// Some frames are damaged.
     Noise = "noise",
@@ -112,9 +112,9 @@ causes! {
     PeerSilent = "peer_silent",
     /// Another slave answers.
     PeerOther = "peer_other",
-    /// What is sent is heard.
+    /// The port receives its own transmissions.
     Echo = "echo",
-    /// A slave refuses.
+    /// A slave refuses requests.
     PeerRefuses = "peer_refuses",
     /// The CAN controller has left the bus.
     BusOff = "bus_off",
@@ -122,29 +122,29 @@ causes! {
     BusErrors = "bus_errors",
     /// CAN frames have ids that no recipe has.
     ForeignIds = "foreign_ids",
-    /// The number is right, and the kind of id is not.
+    /// The number of a CAN id is right, but not its kind.
     IdKind = "id_kind",
     /// CAN frames have another length.
     CanLength = "can_length",
-    /// Remote frames come in place of data.
+    /// Remote frames arrive instead of data.
     Remote = "remote",
-    /// The controller's port does not take a connection.
+    /// The controller's port refuses connections.
     Refused = "refused",
     /// Nobody answers at the controller's address.
     Unreachable = "unreachable",
     /// The controller's name cannot be resolved.
     NoSuchHost = "no_such_host",
-    /// Connected, and nothing comes.
+    /// The link is connected but nothing arrives.
     LinkSilent = "link_silent",
-    /// What comes is of another protocol or dialect.
+    /// The data is of another protocol or dialect.
     Dialect = "dialect",
     /// The controller refuses requests.
     LinkRefuses = "link_refuses",
-    /// Datagrams are sent and nothing comes back.
+    /// Datagrams are sent but none come back.
     OneWay = "one_way",
     /// The controller has not connected to the listening port.
     NotConnected = "not_connected",
-    /// Somebody else than the controller connects.
+    /// A peer other than the controller connects.
     Stranger = "stranger",
     /// The controller is in manual mode.
     Manual = "manual",
@@ -154,31 +154,31 @@ causes! {
     Disabled = "disabled",
     /// The controller is still starting.
     Starting = "starting",
-    /// The emergency stop or a safety door.
+    /// The emergency stop or a safety door is active.
     SafetyStop = "safety_stop",
-    /// A program runs already.
+    /// A program is already running.
     ProgramRuns = "program_runs",
     /// No program has this name.
     ProgramName = "program_name",
-    /// What the command asks for is so already.
+    /// The requested state is already reached.
     NothingToDo = "nothing_to_do",
-    /// A command failed and nothing says why.
+    /// A command failed for an unknown reason.
     CommandFailed = "command_failed",
-    /// No reply came to a command.
+    /// A command got no reply.
     NoReply = "no_reply",
-    /// A command was answered in words that are not known.
+    /// A command got a reply with an unknown text.
     OtherReply = "other_reply",
     /// A command was not sent.
     NotSent = "not_sent",
-    /// A value that is a command only set the base, because it was the first.
+    /// The first value of a command field only set the base.
     FirstValue = "first_value",
-    /// A value is in no table of commands.
+    /// A value is in no command table.
     UnknownValue = "unknown_value",
-    /// The gateway itself slept: commands may be among the input that was discarded.
+    /// The gateway itself slept: the discarded input may contain commands.
     Slept = "slept",
 }
 
-/// What is wrong, with the words for people.
+/// What is wrong, with its texts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
     /// How much it matters.

@@ -1,4 +1,4 @@
-//! Findings about values that gave no command, and about presses that may be among discarded input.
+//! Findings about values that gave no command, and about presses that may be in discarded input.
 
 use proto_core::config::{ConfigView, Recipe};
 use proto_core::engine::{DropReason, Rejection};
@@ -23,7 +23,7 @@ fn gives_commands(config: ConfigView<'_>, recipe: &Recipe) -> bool {
     config.fields_of(recipe, Direction::Input).any(|(_, _, field)| is_command(field))
 }
 
-/// A value that should have been a command, and picked none.
+/// A value that should have been a command but picked none.
 fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
     let &Withheld { why, value, age, .. } = withheld;
     // A command since then shows that the device is understood.
@@ -50,7 +50,7 @@ fn no_command(seen: &PortCase<'_>, withheld: &Withheld) -> Option<Finding> {
             "The device sends another number than the table has, or the field is at another place",
             "Add the value to `commands`, write it as `idle`, or correct the field",
         )),
-        // What was picked and not sent shows in the port's reply.
+        // The port's reply shows commands that were picked and not sent.
         _ => None,
     }
 }

@@ -1,11 +1,11 @@
 //! Why does it not work? Findings in words, from what a gateway knows.
 //!
-//! In: a [`Case`]: the configuration, the state of an engine or of a gateway elsewhere, the recent bytes and ids of each port, and what
-//! is known of each link. Out: [`Finding`]s: what is seen, what was expected, the likely cause and the
-//! remedy. Everything here is a function of its arguments: no clock, no sockets, no devices.
+//! In: a [`Case`]: the configuration, the state of an engine or of another gateway, the recent bytes and ids of each
+//! port, and facts about each link. Out: [`Finding`]s: what was seen, what was expected, the likely cause and the
+//! remedy. Does not know clocks, sockets or devices: everything here is a function of its arguments.
 //!
-//! A finding is a guess with reasons. What works is not spoken of: without trouble in the counters of the
-//! last seconds no bytes are looked at, but for the byte order of numbers, which no counter shows.
+//! A finding is a guess with reasons. Nothing is said about what works. Bytes are only examined if the counters of the
+//! last seconds show trouble, except for the byte order of numbers, which no counter shows.
 
 #![forbid(unsafe_code)]
 
@@ -40,25 +40,24 @@ pub use record::{KEPT, LinkFacts, PortRecord, Reach, WINDOW};
 pub use state::State;
 pub use watch::{Change, Watch};
 
-/// Everything that findings are made of.
+/// The input of an examination.
 #[derive(Debug, Clone)]
 pub struct Case<'a> {
     /// The gateway's configuration.
     pub config: ConfigView<'a>,
-    /// What it says of itself.
+    /// The gateway's state.
     pub status: State,
-    /// What came in at each field port; a port without a record is judged by its counters alone.
+    /// Input of each field port. A port without a record is judged by its counters alone.
     pub ports: &'a [PortRecord],
-    /// What the driver knows of each link beyond the status; may be empty.
+    /// What the driver knows of each link beyond its status; may be empty.
     pub links: &'a [LinkFacts],
     /// How long the gateway has been running.
     pub running: Duration,
-    /// The controller's states, if somebody else than the engine has looked: for configurations that need
-    /// no state stream.
+    /// The controller's states, if they were read outside the engine: for configurations that need no state stream.
     pub looked: Option<States>,
 }
 
-/// What is wrong, ports first, then links, then the controller; empty if nothing is.
+/// All findings: ports first, then links, then the controller.
 pub fn examine(case: &Case<'_>) -> Vec<Finding> {
     let mut findings = Vec::new();
     port::examine(case, &mut findings);

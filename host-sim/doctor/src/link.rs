@@ -1,4 +1,4 @@
-//! Findings about links: is the controller reached, and does it answer.
+//! Findings about links: whether the controller is reached, and whether it replies.
 
 use proto_core::config::Parts;
 use proto_core::engine::{LinkKind, Transport};
@@ -10,7 +10,7 @@ use crate::state;
 
 pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     for info in &case.status.links {
-        // What the second connection to port 2000 lacks, the first carries.
+        // The first connection to port 2000 carries what the second cannot.
         if info.kind == LinkKind::Urgent {
             continue;
         }
@@ -40,7 +40,7 @@ impl LinkCase<'_> {
         }
     }
 
-    /// What the port is for, and where it is switched on.
+    /// The purpose of the port, and where to switch it on.
     fn service(&self) -> (&'static str, &'static str) {
         match self.info.kind {
             LinkKind::Command => ("the command port, usually 2000", "command"),
@@ -68,7 +68,7 @@ impl LinkCase<'_> {
     fn not_connected(&self, reach: Option<&Reach>) -> Option<Finding> {
         let (what, key) = self.service();
         let tried = self.info.history.failed_opens;
-        // The first attempt is still under way.
+        // The first attempt is still in progress.
         if reach.is_none()
             && tried == 0
             && self.info.history.losses == 0
@@ -78,7 +78,7 @@ impl LinkCase<'_> {
         }
         let (to, expected) = (self.to(), format!("a connection to {what}"));
         let host = &self.info.host;
-        // Where the file says where it is.
+        // Where the file has the address.
         let (address, port, where_on) = match self.info.kind {
             LinkKind::ModbusDevice { .. } => {
                 ("to of the port".to_owned(), "to of the port".to_owned(), "device")
@@ -169,8 +169,7 @@ impl LinkCase<'_> {
         })
     }
 
-    /// Whether the recipe of the link to the controller's recipe server has an output part, so that the
-    /// controller sends.
+    /// Whether the controller sends: the recipe of the link to its recipe server has an output part.
     fn expects_answers(&self) -> bool {
         let link = self.case.config.controller.recipe_link;
         let recipe = link.and_then(|link| self.case.config.recipes.get(usize::from(link.recipe)));
@@ -260,5 +259,5 @@ impl LinkCase<'_> {
     }
 }
 
-/// So many datagrams without an answer are no accident.
+/// Number of datagrams without a reply that is no accident.
 const MANY_SENT: u32 = 50;

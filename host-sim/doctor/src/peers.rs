@@ -1,4 +1,4 @@
-//! Findings about slaves and other peers that a port asks.
+//! Findings about slaves and other peers that a port polls.
 
 use proto_core::config::{Exchange, Transaction};
 use proto_core::device::{Algorithm, ByteOrder};
@@ -44,7 +44,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
     let expected = format!("replies of {who}");
     if is_modbus {
         let frames = rtu_frames(&bytes);
-        // A request that is heard is no reply: eight bytes of a function that only reads.
+        // A received request is no reply: eight bytes of a function that only reads.
         let is_request = |frame: &&[u8]| frame.len() == 8 && (1..=4).contains(&frame[1]) && frame[2] != 3;
         if frames.iter().any(|frame| frame[0] == peer.number && is_request(frame)) {
             return seen.place.fault(
@@ -69,7 +69,7 @@ fn silent(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
             );
         }
     }
-    // With settings that were right once, nothing but its power and its wires is left.
+    // The settings were right once, so only power and wires are left.
     if peer.counters.replies > peer.counters.checksums.saturating_mul(10) {
         return seen.place.fault(
             Cause::PeerSilent,
@@ -136,7 +136,7 @@ fn refuses(seen: &PortCase<'_>, peer: Peer, is_modbus: bool) -> Finding {
     )
 }
 
-/// The gateway is the slave.
+/// Findings for a port where the gateway is the slave.
 fn served(seen: &PortCase<'_>, exchanges: &[Exchange], findings: &mut Vec<Finding>) {
     let Some(own) = exchanges.first().map(|exchange| exchange.peer) else { return };
     if seen.counters.frames_in > 0 || !seen.is_silent() {
@@ -159,7 +159,7 @@ fn shown(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(12)]
 }
 
-/// Frames of Modbus RTU among bytes: an address, a function and a right checksum around them.
+/// Frames of Modbus RTU in a byte stream: an address, a function and a matching checksum.
 fn rtu_frames(bytes: &[u8]) -> Vec<&[u8]> {
     let (mut at, mut frames) = (0, Vec::new());
     while at + 4 <= bytes.len() {
@@ -174,14 +174,14 @@ fn rtu_frames(bytes: &[u8]) -> Vec<&[u8]> {
     frames
 }
 
-/// The length of the frame of Modbus RTU at the front.
+/// The length of the Modbus RTU frame at the front.
 fn rtu_len(bytes: &[u8]) -> Option<usize> {
     let function = *bytes.get(1)?;
     let is_known = matches!(function & 0x7F, 1..=6 | 15 | 16 | 22 | 23);
     if !is_known || bytes[0] > 247 {
         return None;
     }
-    // What the third byte of a reply says, a request or a short reply, both of function 22, a refusal.
+    // A reply with a byte count, a request or a short reply, both of function 22, a refusal.
     let counted = bytes.get(2).map(|count| usize::from(*count) + 5);
     let lens = [counted, Some(8), Some(10), Some(5)];
     lens.into_iter().flatten().find(|&len| {

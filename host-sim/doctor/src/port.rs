@@ -1,4 +1,4 @@
-//! Findings about field ports: what comes in, and why it is no frame.
+//! Findings about field ports: what arrives, and why it is not a frame.
 
 use proto_core::config::{Bus, Parity};
 use proto_core::engine::{FieldBus, PortCounters, PortId, PortState, Rejection};
@@ -32,7 +32,7 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     }
 }
 
-/// What was counted between two instants, of the counters that tell something.
+/// Increments between two instants of the counters that findings use.
 fn since(now: &PortCounters, before: &PortCounters) -> PortCounters {
     let mut counters = *now;
     macro_rules! subtract {
@@ -75,12 +75,12 @@ impl PortCase<'_> {
         )
     }
 
-    /// Whether an input frame is overdue, or has never come.
+    /// Whether an input frame is overdue or has never arrived.
     pub(crate) fn is_silent(&self) -> bool {
         self.status.overdue > 0
     }
 
-    /// In words, how many bytes and frames came within the window.
+    /// The number of bytes and frames within the window, in words.
     pub(crate) fn came(&self) -> String {
         let (bytes, frames) = (self.counters.bytes_in as usize, self.counters.frames_in as usize);
         format!("{}, {}", count(bytes, "byte"), count(frames, "frame"))
@@ -94,8 +94,8 @@ impl PortCase<'_> {
         }
         let Some(shape) = Shape::of(self.case.config, self.recipe) else { return };
         if counters.bytes_in == 0 {
-            // A device that is asked is judged by its answers.
-            // A device that has never sent a whole frame is judged by the piece that it sent.
+            // A polled device is judged by its replies. A device that has never sent a whole frame is judged by the
+            // piece that it sent.
             let broken = self.broken_off(&shape).filter(|_| self.status.age.is_none() || !self.is_silent());
             if broken.is_some() {
                 findings.extend(broken);
@@ -114,7 +114,7 @@ impl PortCase<'_> {
         findings.extend(found);
     }
 
-    /// The newest bytes; without a record those of the newest rejection.
+    /// The newest bytes; without a record, the bytes of the newest rejection.
     fn bytes(&self) -> Vec<u8> {
         let bytes = self.record.bytes();
         match (bytes.is_empty(), &self.status.rejection) {
@@ -123,7 +123,7 @@ impl PortCase<'_> {
         }
     }
 
-    /// Whether so many of the window's frames were rejected that it is no accident.
+    /// Whether too many of the window's frames were rejected for an accident.
     fn are_many(&self, rejected: u32) -> bool {
         rejected >= 3 && rejected.saturating_mul(10) > self.counters.frames_in
             || rejected >= 1 && self.counters.frames_in == 0
@@ -217,12 +217,12 @@ impl PortCase<'_> {
         None
     }
 
-    /// Frames or fields with a value that is not taken.
+    /// Finding for frames or fields with a value that is rejected.
     fn bad_value(&self, shape: &Shape<'_>, bytes: &[u8], rejected: String) -> Finding {
         use Rejection::{NotFinite, OutOfRange, Unreadable};
         let is_value = |why| matches!(why, NotFinite | OutOfRange | Unreadable);
         let last = self.status.rejection.as_ref().filter(|last| is_value(last.why));
-        // Of a long frame only the beginning is kept.
+        // Only the beginning of a long frame is kept.
         let whole = last.filter(|last| last.len == last.bytes.len());
         let kept = whole.and_then(|last| value::on_line(shape, &last.bytes));
         let heard = || shape.frames(bytes).last().map(|frame| frame.to_vec());
@@ -231,7 +231,7 @@ impl PortCase<'_> {
             Some((frame.to_vec(), Some(misfit)))
         });
         let (frame, misfit) = heard_wrong.unwrap_or_else(|| {
-            // Escape bytes are no part of the frame.
+            // Escape bytes do not belong to the frame.
             let misfit = match (&shape.device, whole) {
                 (Some(_), Some(last)) => value::misfit(shape, &last.bytes),
                 _ => kept.as_ref().and_then(|frame| value::misfit(shape, frame)),
@@ -257,7 +257,7 @@ impl PortCase<'_> {
         )
     }
 
-    /// In words, so many frames were found, accepted or not.
+    /// The number of frames found, accepted or not, in words.
     fn came_of(&self, rejected: u32) -> String {
         let frames = self.counters.frames_in.wrapping_add(rejected) as usize;
         format!("{}, {}", count(self.counters.bytes_in as usize, "byte"), count(frames, "frame"))
@@ -306,7 +306,7 @@ impl PortCase<'_> {
         )
     }
 
-    /// Bytes that are no frame.
+    /// Finding for bytes that are not a frame.
     fn nearest(&self, shape: &Shape<'_>, bytes: &[u8]) -> Option<Finding> {
         let counters = &self.counters;
         if counters.frames_in > 0 {
@@ -375,7 +375,7 @@ impl PortCase<'_> {
         let last = self.status.rejection.as_ref();
         let last = last.filter(|last| last.why == Rejection::Partial && last.age < REPORTED_FOR)?;
         if self.status.age.is_some_and(|age| age < last.age) {
-            // The device goes on.
+            // The device has sent a whole frame since.
             return None;
         }
         let whole = match shape.lengths() {
@@ -445,11 +445,11 @@ impl PortCase<'_> {
         )
     }
 
-    /// Frames come, and others are damaged.
+    /// Finding for good frames among damaged ones.
     fn noise(&self, shape: &Shape<'_>) -> Option<Finding> {
         let counters = &self.counters;
         let longest = shape.lengths().map_or(1, |(_, longest)| longest.max(1) as u32);
-        // At least so many pieces.
+        // Lower bound of the number of damaged frames.
         let pieces = counters.discarded_bytes / longest;
         let bad =
             [counters.tail_mismatches, counters.rejected_checksum, counters.rejected_not_finite, pieces];
@@ -471,8 +471,8 @@ fn first(bytes: &[u8]) -> &[u8] {
     &bytes[..bytes.len().min(SHOWN)]
 }
 
-/// Number of bytes that are shown.
+/// Maximum number of bytes that are shown.
 const SHOWN: usize = 12;
-/// Silence that is worth a word.
+/// Minimum silence that is reported.
 const NOTHING_FOR: proto_core::time::Duration = proto_core::time::Duration::from_secs(3);
 const _: () = assert!(NOTHING_FOR.as_micros() < WINDOW.as_micros());

@@ -7,7 +7,7 @@ use crate::finding::FindingPlace;
 use crate::record::PortRecord;
 use crate::{Case, state};
 
-/// A port and what was seen of it in the window.
+/// A port and its data within the window.
 pub(crate) struct PortCase<'a> {
     pub(crate) case: &'a Case<'a>,
     pub(crate) port: &'a Port,
@@ -15,6 +15,6 @@ pub(crate) struct PortCase<'a> {
     pub(crate) place: FindingPlace,
     pub(crate) status: &'a state::ObservedPort,
     pub(crate) record: &'a PortRecord,
-    /// Counted within the window.
+    /// Increments within the window.
     pub(crate) counters: PortCounters,
 }

@@ -1,6 +1,6 @@
-//! What a driver keeps for the doctor: the newest bytes and ids of a port, and facts of a link.
+//! What a driver records for the doctor: the newest bytes and ids of a port, and facts about a link.
 //!
-//! Everything is bounded, and taking a chunk costs a copy of its bytes.
+//! Everything is bounded. Recording a chunk costs a copy of its bytes.
 
 use std::collections::VecDeque;
 
@@ -10,31 +10,31 @@ use proto_core::wire::can::{CanFrame, CanId};
 
 /// Number of newest bytes of a port that are kept.
 pub const KEPT: usize = 1024;
-/// Maximum number of ids of a CAN bus that are counted; further ones are left out.
+/// Maximum number of CAN ids that are counted; further ids are ignored.
 const MAX_IDS: usize = 64;
-/// Counters of earlier instants that are kept: those of a window, noted twice a second.
+/// Counters of earlier instants that are kept: those of one window, noted twice a second.
 const NOTES: usize = 16;
 /// Capacity for the name of a device.
 const DEVICE: usize = 128;
-/// Findings are about this much time before now.
+/// Findings cover this much time before now.
 pub const WINDOW: Duration = Duration::from_secs(5);
 
-/// What came in at a field port.
+/// Input of a field port.
 #[derive(Debug)]
 pub struct PortRecord {
     /// The port.
     pub port: PortId,
     bytes: VecDeque<u8>,
-    /// Frames of each id in this window and in the one before.
+    /// Frames of each id in this window and in the previous one.
     ids: Vec<SeenId>,
     turned_at: Instant,
     /// Counters at earlier instants, the oldest first.
     before: VecDeque<(Instant, PortCounters)>,
-    /// Commands that values have picked, and when the newest was, if that was seen.
+    /// Number of commands that values have picked, and when the newest was picked, if that was observed.
     commands: Option<(u32, Option<Instant>)>,
-    /// CAN FD frames, which no recipe takes.
+    /// CAN FD frames, which no recipe uses.
     pub fd_frames: u64,
-    /// Where the port is bound to, such as `serial:/dev/ttyUSB0`; may be empty.
+    /// The device of the port's `--bind`, such as `serial:/dev/ttyUSB0`; may be empty.
     pub device: String,
 }
 
@@ -45,7 +45,7 @@ impl Clone for PortRecord {
         copy
     }
 
-    /// In the room that a copy has already: the thread that moves the data makes one each second.
+    /// Reuses allocations: the thread that moves the data makes a copy every second.
     fn clone_from(&mut self, from: &Self) {
         let Self { port, bytes, ids, turned_at, before, commands, fd_frames, device } = from;
         (self.port, self.turned_at, self.fd_frames) = (*port, *turned_at, *fd_frames);
@@ -61,7 +61,7 @@ impl Clone for PortRecord {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SeenId {
     pub(crate) id: CanId,
-    /// Length of the newest.
+    /// Length of the newest frame.
     pub(crate) len: usize,
     now: u32,
     before: u32,
@@ -88,7 +88,7 @@ impl PortRecord {
         }
     }
 
-    /// Bytes came. The newest [`KEPT`] are kept.
+    /// Records received bytes. The newest [`KEPT`] are kept.
     pub fn heard(&mut self, bytes: &[u8]) {
         let bytes = &bytes[bytes.len().saturating_sub(KEPT)..];
         let excess = (self.bytes.len() + bytes.len()).saturating_sub(KEPT);
@@ -96,7 +96,7 @@ impl PortRecord {
         self.bytes.extend(bytes);
     }
 
-    /// A CAN frame came.
+    /// Records a received CAN frame.
     pub fn frame(&mut self, frame: &CanFrame) {
         let (id, len) = (frame.id(), frame.data().len());
         if let Some(seen) = self.ids.iter_mut().find(|seen| seen.id == id) {
@@ -106,14 +106,14 @@ impl PortRecord {
         }
     }
 
-    /// Notes the counters of this instant; to be called about once a second.
+    /// Records the counters of this instant; to be called about once a second.
     pub fn note(&mut self, now: Instant, counters: &PortCounters) {
         self.commands = match self.commands {
             None => Some((counters.commands, None)),
             Some((count, _)) if count != counters.commands => Some((counters.commands, Some(now))),
             same => same,
         };
-        // Noted more often, the window is shorter.
+        // If it is called more often, the window is shorter.
         if self.before.len() == NOTES {
             self.before.pop_front();
         }
@@ -130,7 +130,7 @@ impl PortRecord {
         }
     }
 
-    /// The counters at the beginning of the window; zeros if the run is younger.
+    /// The counters at the beginning of the window; zeros if the run has started since.
     pub(crate) fn counters_before(&self, now: Instant) -> PortCounters {
         let is_old = |at: Instant| now.saturating_since(at) >= WINDOW;
         match self.before.front() {
@@ -139,7 +139,7 @@ impl PortRecord {
         }
     }
 
-    /// When the newest command was picked, to a second; `None` if nobody saw it.
+    /// When the newest command was picked, to a second; `None` if that was not observed.
     pub(crate) fn newest_command(&self) -> Option<Instant> {
         self.commands?.1
     }
@@ -159,7 +159,7 @@ impl PortRecord {
 pub struct LinkFacts {
     /// The link.
     pub link: LinkId,
-    /// Whether its place was reached, if that was tried.
+    /// How the newest attempt to reach it ended, if there was one.
     pub reach: Option<Reach>,
     /// Connections and datagrams from other addresses than the controller's.
     pub strangers: u64,
@@ -175,9 +175,9 @@ pub enum Reach {
     Refused,
     /// There was no answer.
     NoAnswer,
-    /// The name is not known.
+    /// The name cannot be resolved.
     NoSuchHost,
-    /// It cannot be tried without sending something.
+    /// The peer cannot be probed without sending something.
     Untried,
     /// Another error, in the system's words.
     Failed(String),

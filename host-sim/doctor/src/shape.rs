@@ -1,4 +1,4 @@
-//! The frame that a line's device should send, as the doctor compares it with what comes.
+//! The expected frame of a serial line, to compare received bytes with.
 
 use proto_core::config::{ConfigView, DeviceFrame, FieldSpec, Parts, Recipe, StreamPart};
 use proto_core::device::{Boundary, ByteOrder, Carrier, Element, Escape, Kind, Part};
@@ -10,16 +10,16 @@ use proto_core::wire::scalar::ScalarType;
 pub(crate) struct Shape<'c> {
     pub(crate) head: &'c [u8],
     pub(crate) tail: &'c [u8],
-    /// Its length in bytes, if all frames have the same and nothing else than the fields ends them.
+    /// Length in bytes, if it is the same for all frames and nothing but the fields ends them.
     pub(crate) len: Option<usize>,
     /// All fields of the part, in order.
     pub(crate) fields: &'c [FieldSpec],
-    /// What tells frames apart, if their fields do not.
+    /// What separates frames, if not their fields.
     pub(crate) boundary: Boundary,
     pub(crate) escape: Option<Escape>,
     pub(crate) floats: Vec<NumberField>,
     pub(crate) constants: Vec<Constant>,
-    /// The frame of a device, with its fields; `None` for a recipe as the controller has it.
+    /// The frame of a device, with its fields; `None` for a recipe that the controller can have.
     pub(crate) device: Option<(DeviceFrame, &'c [FieldSpec], Carrier)>,
 }
 
@@ -106,13 +106,13 @@ impl<'c> Shape<'c> {
         self.device = Some((frame, fields, carrier));
     }
 
-    /// The shortest and the longest frame in bytes, escape bytes left out; `None` if that is not known.
+    /// Minimum and maximum length of a frame in bytes without escape bytes, if known.
     pub(crate) fn lengths(&self) -> Option<(usize, usize)> {
         let of_device = self.device.as_ref().map(|(frame, ..)| frame.layout.lengths());
         of_device.or_else(|| self.len.map(|len| (len, len)))
     }
 
-    /// The beginnings of right frames, as far as head and tail tell, in bytes of equal frames.
+    /// The beginnings of frames whose head and tail are right, if all frames have the same length.
     pub(crate) fn frames<'b>(&self, bytes: &'b [u8]) -> Vec<&'b [u8]> {
         let Some(len) = self.len else { return Vec::new() };
         let (mut at, mut frames) = (0, Vec::new());

@@ -1,4 +1,4 @@
-//! What a gateway says of itself, in a form of its own: taken from an engine, or read from the documents of the API.
+//! The state of a gateway, taken from an engine or read from documents of the API.
 
 use proto_core::engine::{
     DropReason, FieldBus, LinkCounters, LinkId, LinkKind, PeerCounters, PortCounters, PortId, PortState,
@@ -26,10 +26,10 @@ pub(crate) struct ObservedPort {
     pub(crate) bus: FieldBus,
     pub(crate) state: PortState,
     pub(crate) age: Option<Duration>,
-    /// Number of its input frames that are overdue or have never come.
+    /// Number of input frames that are overdue or have never arrived.
     pub(crate) overdue: usize,
     pub(crate) reply: ReplyCode,
-    /// The newest command that one of its values picked, such as `run(pick.jspf)`.
+    /// The newest command that a value picked, such as `run(pick.jspf)`.
     pub(crate) command: Option<String>,
     pub(crate) not_given: Option<Withheld>,
     pub(crate) failed: Option<FailedCommand>,
@@ -41,18 +41,18 @@ pub(crate) struct ObservedPort {
 /// A value that gave no command.
 #[derive(Debug, Clone)]
 pub(crate) struct Withheld {
-    /// The reason, if it is one that this program knows.
+    /// The reason, if this program knows it.
     pub(crate) why: Option<DropReason>,
     pub(crate) text: String,
     pub(crate) value: i64,
     pub(crate) age: Duration,
 }
 
-/// A command that the controller replied to with a failure.
+/// A command whose reply was a failure.
 #[derive(Debug, Clone)]
 pub(crate) struct FailedCommand {
     pub(crate) command: String,
-    /// How long ago the reply came.
+    /// Time since the reply.
     pub(crate) age: Duration,
     pub(crate) controller: Option<States>,
 }
@@ -62,13 +62,13 @@ pub(crate) struct FailedCommand {
 pub(crate) struct Rejected {
     pub(crate) why: Rejection,
     pub(crate) age: Duration,
-    /// Length of what was rejected.
+    /// Length of the rejected data.
     pub(crate) len: usize,
-    /// Its first bytes.
+    /// The first rejected bytes.
     pub(crate) bytes: Vec<u8>,
 }
 
-/// A slave, or another peer that exchanges of a port are with.
+/// A slave or another peer of a port's exchanges.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peer {
     pub(crate) number: u8,
@@ -84,20 +84,20 @@ pub(crate) struct ObservedLink {
     pub(crate) transport: Transport,
     pub(crate) host: String,
     pub(crate) is_up: bool,
-    /// How long it has been up, as far as that is known.
+    /// How long the link has been up, if known.
     pub(crate) up_for: Duration,
     pub(crate) history: LinkHistory,
     pub(crate) counters: LinkCounters,
-    /// The newest text of the command port that no command got as its reply.
+    /// The newest text of the command port that was not the reply to a command.
     pub(crate) other_text: Option<OtherText>,
 }
 
-/// A text that no command got as its reply.
+/// A text that was not the reply to a command.
 #[derive(Debug, Clone)]
 pub(crate) struct OtherText {
     pub(crate) text: String,
     pub(crate) age: Duration,
-    /// The unanswered command whose reply it may be.
+    /// The unanswered command that the text may be the reply to.
     pub(crate) command: Option<String>,
 }
 

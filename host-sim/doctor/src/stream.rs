@@ -1,10 +1,10 @@
-//! The nearest fit of bytes to the frame that was expected: head, tail, length, byte order.
+//! The best match of received bytes with the expected frame: head, tail, length, byte order.
 
 use crate::bytes::{is_at, most, places};
 use crate::shape::{NumberField, Shape};
 use proto_core::device::ByteOrder;
 
-/// How bytes differ from the frames that were expected.
+/// How bytes differ from the expected frames.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Fit {
     /// The head's bytes in the other order.
@@ -15,27 +15,27 @@ pub(crate) enum Fit {
     HeadDiffers {
         seen: Vec<u8>,
     },
-    /// The head is there when bit 7 is left out.
+    /// The head matches if bit 7 is ignored.
     SevenBits,
     /// Frames of the right length end with other bytes.
     TailDiffers {
         seen: Vec<u8>,
     },
-    /// Frames of another length.
+    /// Frames have another length.
     Length {
         seen: usize,
     },
-    /// A head, and too few bytes behind it.
+    /// A head with too few bytes after it.
     BrokenOff {
         seen: usize,
     },
     NoHead,
 }
 
-/// The farthest that a frame's length may be from the right one to be found.
+/// Maximum difference from the right length at which a frame is still recognised.
 const NEAR: usize = 8;
 
-/// The nearest fit. `None` if frames seem right, or if there is too little to tell.
+/// The best match. `None` if frames seem right, or there are too few bytes to tell.
 pub(crate) fn fit(shape: &Shape<'_>, bytes: &[u8]) -> Option<Fit> {
     let head = shape.head;
     if head.is_empty() {
@@ -56,7 +56,7 @@ pub(crate) fn fit(shape: &Shape<'_>, bytes: &[u8]) -> Option<Fit> {
     let shortest = head.len() + shape.tail.len();
     let ways: Vec<usize> = (len.saturating_sub(NEAR).max(shortest)..=len + NEAR).collect();
     let best = |needs_tail: bool| {
-        // Of equal ones the right length.
+        // The right length wins a tie.
         let scores = ways.iter().map(|&way| (distance(&heads, needs_tail, way), way == len, way));
         scores.max().filter(|(score, ..)| *score > 0)
     };
@@ -86,7 +86,7 @@ fn tail_of(shape: &Shape<'_>, bytes: &[u8], heads: &[usize], len: usize) -> Opti
     (seen != shape.tail).then(|| Fit::TailDiffers { seen: seen.to_vec() })
 }
 
-/// One frame, or the beginning of one, with nothing behind it.
+/// One frame or the beginning of one, with nothing after it.
 fn single(shape: &Shape<'_>, bytes: &[u8], at: usize, len: usize) -> Option<Fit> {
     let rest = &bytes[at..];
     let tails = places(rest, shape.tail);
@@ -102,7 +102,7 @@ fn single(shape: &Shape<'_>, bytes: &[u8], at: usize, len: usize) -> Option<Fit>
     }
 }
 
-/// Bytes in which the head does not occur.
+/// Bytes that do not contain the head.
 fn without_head(shape: &Shape<'_>, bytes: &[u8]) -> Option<Fit> {
     let head = shape.head;
     if bytes.len() < head.len() {
@@ -120,7 +120,7 @@ fn without_head(shape: &Shape<'_>, bytes: &[u8]) -> Option<Fit> {
             }
             None => found.len() >= 2,
         };
-        // Two bytes come by chance once in 65536; a frame around them does not.
+        // Two bytes occur by chance once in 65536, but not with a frame around them.
         if found.iter().any(is_frame) {
             return Some(Fit::HeadSwapped { seen: swapped });
         }
@@ -139,7 +139,7 @@ fn without_head(shape: &Shape<'_>, bytes: &[u8]) -> Option<Fit> {
     Some(Fit::NoHead)
 }
 
-/// The bytes in the head's place of frames that end with the right tail.
+/// The bytes at the head's place in frames that end with the right tail.
 fn head_before_tails(shape: &Shape<'_>, bytes: &[u8], len: usize) -> Option<Vec<u8>> {
     if shape.tail.len() < 2 {
         return None;
@@ -160,8 +160,7 @@ fn fit_tails(shape: &Shape<'_>, bytes: &[u8], len: usize) -> Option<Fit> {
     (way != len && count >= 2).then_some(Fit::Length { seen: way })
 }
 
-/// Whether the floats of right frames make sense in the other byte order only; the order that they were
-/// read in, and an example of both.
+/// Whether the floats of right frames are only plausible in the other byte order: an example as read, and swapped.
 pub(crate) fn other_order(shape: &Shape<'_>, frames: &[&[u8]]) -> Option<(f64, f64)> {
     let (mut read, mut swapped, mut all) = (0_usize, 0_usize, 0_usize);
     let mut example = None;
@@ -182,18 +181,18 @@ pub(crate) fn other_order(shape: &Shape<'_>, frames: &[&[u8]]) -> Option<(f64, f
     (all >= MIN_VALUES && swapped == all && read * 4 <= all).then_some(example).flatten()
 }
 
-/// Number of values other than zero that are needed to tell.
+/// Minimum number of values other than zero for a decision.
 const MIN_VALUES: usize = 6;
 
-/// A number that something measures.
+/// Whether a value is plausible for a measurement.
 fn is_sensible(value: f64) -> bool {
     value.is_finite() && (1e-6..=1e7).contains(&value.abs())
 }
 
-/// A float as the recipe reads it, and with its bytes reversed.
+/// A float in the recipe's byte order, and with its bytes reversed.
 fn values(number: &NumberField, frame: &[u8]) -> Option<(f64, f64)> {
     let bytes = frame.get(number.at..number.at + number.size)?;
-    // Little and big, or the two orders of words: what is other than the one is the other.
+    // Little or big endian, or one of the two word orders; the other one is the alternative.
     let (mut own, mut other) = (bytes.to_vec(), bytes.to_vec());
     match number.order {
         ByteOrder::Little => other.reverse(),

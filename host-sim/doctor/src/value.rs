@@ -1,7 +1,7 @@
-//! Which field of a rejected frame has a value that is not taken, and what would be.
+//! Which field of a rejected frame has a value that is not accepted, and the accepted values.
 //!
-//! In: a frame of the recipe, with head and tail. Out: the first field that a gateway rejects the frame for, in
-//! words, and the bytes as they are on the line, as `host-sim decode` takes them.
+//! In: a frame of the recipe, with head and tail. Out: the first field for which a gateway rejects the frame, in words,
+//! and the bytes as they are on the line, as `host-sim decode` takes them.
 
 use proto_core::config::{FieldSpec, Fitting, InputBinding, InputRule};
 use proto_core::device::{Boundary, Encoding};
@@ -10,22 +10,22 @@ use proto_core::wire::scalar::Scalar;
 
 use crate::shape::Shape;
 
-/// A field whose value is not taken.
+/// A field whose value is not accepted.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Misfit {
-    /// Such as `field 1, for WordInputReg[1], is 400`.
+    /// For example `field 1, for WordInputReg[1], is 400`.
     pub(crate) seen: String,
-    /// Such as `-327.68..=327.67`.
+    /// For example `-327.68..=327.67`.
     pub(crate) expected: String,
 }
 
-/// The first field of a frame that is not taken; `None` if all are, or if it is no frame of the recipe.
+/// The first field of a frame that is not accepted; `None` if all are, or the frame is not of the recipe.
 pub(crate) fn misfit(shape: &Shape<'_>, frame: &[u8]) -> Option<Misfit> {
     match &shape.device {
         Some((device, fields, _)) => {
             let values = device.layout.values(&device.elements, frame);
             let numbered = (0..fields.len()).filter(|&at| fields[at].element().is_some());
-            // In the file, what stands behind a field is a key of it.
+            // In the file, rules of a field are keys of the field.
             let nth = |at: usize| 1 + fields[..at].iter().filter(|field| !field.is_of_field_before()).count();
             numbered.zip(values).find_map(|(at, value)| match value {
                 Ok(value) => not_taken_device(nth(at), &fields[at..], value?),
@@ -52,7 +52,7 @@ pub(crate) fn misfit(shape: &Shape<'_>, frame: &[u8]) -> Option<Misfit> {
     }
 }
 
-/// Whether digits may be none, or have a comma, so that only the gateway can tell.
+/// Whether digits may be absent or have a comma, in which case only the gateway can tell.
 fn has_own_digits(fields: &[FieldSpec]) -> bool {
     let behind = fields.iter().skip(1).take_while(|field| field.is_of_field_before());
     behind
@@ -60,7 +60,7 @@ fn has_own_digits(fields: &[FieldSpec]) -> bool {
         .any(|rule| matches!(rule, FieldSpec::InputRule(InputRule::NoText(_) | InputRule::Comma)))
 }
 
-/// The first of these fields, of a device's frame.
+/// The first of these fields of a device's frame.
 fn not_taken_device(nth: usize, fields: &[FieldSpec], value: Scalar) -> Option<Misfit> {
     let field = fields.first()?;
     let Some((taken, allowed)) = judge_field(fields, Ok(value), &[]) else {
@@ -93,7 +93,7 @@ fn not_taken(nth: usize, field: &FieldSpec, value: Scalar) -> Option<Misfit> {
     Some(Misfit { seen: format!("{name} is {}", number(value.as_f64())), expected })
 }
 
-/// A configuration has no names of fields: the number in the file, and the variable.
+/// The field's number in the file and its variable: a configuration has no names of fields.
 fn named(nth: usize, field: &FieldSpec) -> String {
     let var = match *field {
         FieldSpec::System(var)
@@ -104,14 +104,14 @@ fn named(nth: usize, field: &FieldSpec) -> String {
     var.map_or_else(|| format!("field {nth}"), |var| format!("field {nth}, for {var},"))
 }
 
-/// Without the digits that only the way to binary and back makes.
+/// Removes digits that only the conversion to binary and back has added.
 fn number(value: f64) -> String {
     let rounded = format!("{value:.6}").parse().unwrap_or(value);
-    // A sum with 0 has no negative zero.
+    // Adding 0 removes a negative zero.
     format!("{}", rounded + 0.0)
 }
 
-/// A frame that was kept as the engine sees it, with what is around it on the line; `None` if that is not known.
+/// A frame as the engine recorded it, with the bytes around it on the line; `None` if these are unknown.
 pub(crate) fn on_line(shape: &Shape<'_>, kept: &[u8]) -> Option<Vec<u8>> {
     if shape.device.is_none() {
         return Some([shape.head, kept, shape.tail].concat());

@@ -1,31 +1,31 @@
-//! When findings begin and end, so that a log has two lines for each and not one a second.
+//! Tracks when findings begin and end: a log gets two lines for each instead of one a second.
 
 use proto_core::time::{Duration, Instant};
 
 use crate::finding::{Cause, Finding, FindingPlace};
 
-/// A finding is reported once it was found twice in a row, and its end once it was absent for this long.
+/// How long a finding must be absent to end. It begins when it is found twice in a row.
 const GONE_FOR: Duration = Duration::from_secs(5);
 /// Minimum time between two reports of the same place and cause.
 const REPORT_AGAIN: Duration = Duration::from_secs(60);
-/// More kinds of findings than a gateway has.
+/// Maximum number of known findings, more than a gateway has.
 const MAX_KNOWN: usize = 256;
 
-/// A change that is worth a line.
+/// A change that is logged.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Change {
     /// A finding has begun.
     Begins(Finding),
-    /// It is over.
+    /// A finding has ended.
     Ends {
-        /// What it was about.
+        /// What the finding was about.
         place: FindingPlace,
-        /// Its cause.
+        /// The cause of the finding.
         cause: Cause,
     },
 }
 
-/// The findings so far.
+/// Findings that have begun.
 #[derive(Debug, Default)]
 pub struct Watch {
     known: Vec<Known>,
@@ -47,7 +47,8 @@ impl Watch {
         Self::default()
     }
 
-    /// Takes the findings of this instant; returns what has changed. To be called about once a second.
+    /// Compares the findings of this instant with the earlier ones and returns the changes. To be called about once a
+    /// second.
     pub fn update(&mut self, now: Instant, findings: &[Finding]) -> Vec<Change> {
         let mut changes = Vec::new();
         for finding in findings {
