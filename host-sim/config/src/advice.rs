@@ -1,4 +1,4 @@
-//! Warnings about what is valid and often a mistake, that need what only the file says.
+//! Warnings about valid configurations that are often mistakes, where only the file shows them.
 //!
 //! In: the recipes of a gateway file as frames. Out: sentences, each with the key it is about.
 
@@ -9,8 +9,8 @@ use proto_core::wire::scalar::ScalarType;
 
 use crate::device::{DeviceField, DeviceRecipe, NamedExchange, NamedFrame};
 
-/// Output frames that look like orders, such as a control word, and are sent before values of the same device: a
-/// drive starts with the target of the cycle before. `after` at one of the two says that the order is meant.
+/// Output frames that look like commands, such as a control word, and are sent before values of the same device: a
+/// drive then starts with the target of the previous cycle. `after` in either frame says that the order is intended.
 pub fn orders_before_values(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String>, String)> {
     let advice = |recipe: &DeviceRecipe| {
         let frames = if recipe.carrier == Carrier::Can { &recipe.output[..] } else { &[] };
@@ -24,7 +24,7 @@ pub fn orders_before_values(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String
     recipes.iter().flatten().flat_map(advice).collect()
 }
 
-/// Whether `order` starts what `value`, which is sent behind it, has the values of.
+/// Whether `order` starts a motion with values of the frame `value`, which is sent after it.
 fn is_early(order: &NamedFrame, value: &NamedFrame) -> bool {
     let nodes = (node(order), node(value));
     let is_of_one_device = !matches!(nodes, (Some((_, order)), Some((_, value))) if order != value);
@@ -54,7 +54,7 @@ fn early(recipe: &str, order: &NamedFrame, value: &NamedFrame) -> String {
     )
 }
 
-/// The number of the PDO and the node of a frame to a node of CANopen.
+/// The PDO number and the node of a CANopen frame.
 fn node(frame: &NamedFrame) -> Option<(u16, u16)> {
     match frame.id {
         Some(CanId::Standard(id @ 0x201..=0x57F)) if id & 0x7F != 0 && id & 0x80 == 0 => {
@@ -64,7 +64,7 @@ fn node(frame: &NamedFrame) -> Option<(u16, u16)> {
     }
 }
 
-/// The first field that changes and sounds like an order.
+/// The first varying field whose name sounds like a command.
 fn order_in(frame: &NamedFrame) -> Option<&str> {
     let sounds = |name: &str| {
         let name = name.to_ascii_lowercase();
@@ -73,7 +73,7 @@ fn order_in(frame: &NamedFrame) -> Option<&str> {
     varying(frame).find(|name| sounds(name))
 }
 
-/// The first field that changes.
+/// The first varying field.
 fn value_in(frame: &NamedFrame) -> Option<&str> {
     varying(frame).next()
 }
@@ -89,11 +89,11 @@ fn varying(frame: &NamedFrame) -> impl Iterator<Item = &str> {
     frame.fields.iter().filter(is_varying).map(|field| field.name.as_str())
 }
 
-/// Parts of the names of such fields.
+/// Parts of names that sound like commands.
 const ORDERS: [&str; 6] = ["control", "command", "cmd", "start", "trigger", "enable"];
 
-/// Fields that can be negative and write a variable that cannot, without `offset`: a negative number is
-/// rejected. An `offset = 0` that is written says that this is known.
+/// Fields that can be negative and write a variable that cannot, without `offset`: a negative number is rejected. An
+/// explicit `offset = 0` says that this is known.
 pub fn negative_numbers(recipes: &[Option<DeviceRecipe>]) -> Vec<(Vec<String>, String)> {
     let advice = |recipe: &DeviceRecipe| {
         let parts = recipe.input.iter().map(|frame| &frame.fields);

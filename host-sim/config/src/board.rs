@@ -1,7 +1,7 @@
 //! The boards that the firmware runs on, as far as a configuration has to fit them.
 //!
-//! In: a checked configuration. Out: the first thing that this board has not. What every board is refused is told when the
-//! file is read, and when its image is made.
+//! In: a checked configuration. Out: the first thing that exceeds this board. What no board supports is refused when
+//! the file is read or its image is made.
 
 use std::fmt;
 use std::str::FromStr;
@@ -45,10 +45,10 @@ const LINKS: usize = 2;
 const FIELDS: usize = 128;
 const EXCHANGES: usize = 32;
 
-/// The engine in the size of a board, whose ring of frames is of no matter here.
+/// The engine in the size of a board, but without a ring of frames.
 type SizedEngine = Engine<PORTS, LINKS, FIELDS, 0, EXCHANGES>;
 
-/// What a configuration asks for and a board has not.
+/// Something that a configuration needs and a board does not have.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unfit {
     /// Where in the file: names of tables and keys.
@@ -61,7 +61,7 @@ impl Board {
     /// Whether this board can run a configuration: the same checks as at its start.
     ///
     /// # Errors
-    /// The first thing that it has not.
+    /// The first thing that the board does not have.
     pub fn check(&self, config: &GatewayConfig) -> Result<(), Unfit> {
         let (mut lines, mut buses) = (self.serial_ports, self.can_ports);
         for (_, port, _) in config.view().field_ports() {
@@ -133,7 +133,7 @@ mod tests {
 
     #[test]
     fn every_board_of_the_firmware_is_in_the_table() {
-        // Each has a folder.
+        // Each board has a folder.
         let path = format!("{}/../../firmware/src/board", env!("CARGO_MANIFEST_DIR"));
         let entries = std::fs::read_dir(path).unwrap().map(Result::unwrap);
         let known: Vec<_> = entries.filter(|entry| entry.path().is_dir()).collect();

@@ -11,9 +11,9 @@ use crate::sim::SimRecipe;
 /// A recipe of a file.
 #[derive(Debug, Clone, PartialEq)]
 pub enum AnyRecipe {
-    /// One that the controller can have as well.
+    /// A recipe that the controller can have as well.
     Plain(SimRecipe),
-    /// One with a device's own frames, for field ports of the gateway.
+    /// A recipe with a device's own frames, for field ports of the gateway.
     Device(DeviceRecipe),
 }
 
@@ -46,15 +46,15 @@ pub struct DeviceRecipe {
     pub input: Vec<NamedFrame>,
     /// Gateway to device.
     pub output: Vec<NamedFrame>,
-    /// What tells the frames of the input part apart.
+    /// How the frames of the input part are separated.
     pub input_ends: FrameEnds,
-    /// What tells the frames of the output part apart.
+    /// How the frames of the output part are separated.
     pub output_ends: FrameEnds,
-    /// What is asked beside these frames, in the order of the file.
+    /// Exchanges beside these frames, in the order of the file.
     pub exchanges: Vec<NamedExchange>,
 }
 
-/// What tells the frames of a stream part apart.
+/// How the frames of a stream part are separated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct FrameEnds {
     /// Without escape bytes.
@@ -63,34 +63,33 @@ pub struct FrameEnds {
     pub escape: Option<Escape>,
 }
 
-/// An exchange with the names of its fields. Its frames are whole: those of Modbus have address,
-/// function and CRC.
+/// An exchange with the names of its fields. Its frames are complete: those of Modbus have address, function and CRC.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NamedExchange {
     /// The slave's address on Modbus, or the number of the device.
     pub peer: u8,
-    /// Whose frames they are.
+    /// Whether the frames are the device's own or Modbus.
     pub kind: ExchangeKind,
-    /// What asks.
+    /// The request.
     pub request: Option<NamedFrame>,
-    /// What answers.
+    /// The reply.
     pub reply: Option<NamedFrame>,
-    /// What the device sends while it is at it.
+    /// What the device sends while it is still executing the request.
     pub pending: Option<NamedFrame>,
-    /// What the device sends if it refuses the request.
+    /// What the device sends to refuse the request.
     pub refusal: Option<NamedFrame>,
     /// The request is a remote frame on CAN, without data.
     pub remote: bool,
 }
 
-/// Whose frames an exchange has.
+/// The frame format of an exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExchangeKind {
-    /// The device's own.
+    /// The device's own frames.
     Frames,
-    /// Those of Modbus RTU, which the gateway asks as master.
+    /// Modbus RTU with the gateway as master.
     Master(Operation),
-    /// Those of Modbus RTU, which the gateway answers as slave: all of a block is read or written.
+    /// Modbus RTU with the gateway as slave: a block is read or written as a whole.
     Slave(Operation),
 }
 
@@ -103,7 +102,7 @@ impl DeviceRecipe {
         }
     }
 
-    /// What tells the frames of one part apart.
+    /// How the frames of one part are separated.
     pub fn ends(&self, part: Direction) -> FrameEnds {
         match part {
             Direction::Input => self.input_ends,
@@ -123,36 +122,36 @@ pub struct NamedFrame {
     pub tail: Vec<u8>,
     /// The fields, and the checksum at its place.
     pub fields: Vec<DeviceField>,
-    /// Its name, if the file gives it one: of an output frame on CAN.
+    /// Name in the file, if any: only of an output frame on CAN.
     pub name: Option<String>,
-    /// The name of the frame behind which it is sent.
+    /// The name of the frame after which this frame is sent.
     pub after: Option<String>,
 }
 
-/// A field of a device's frame. Its `spec` has no table of commands: the field is unused there, and
-/// `commands` has them.
+/// A field of a device's frame. Its `spec` has no table of commands: the field is unused there, and `commands` has the
+/// table.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DeviceField {
-    /// Name; empty for what needs none.
+    /// Name; empty if it needs none.
     pub name: String,
     /// What it is.
     pub spec: FieldSpec,
-    /// It is a second use of the bytes of the field before, under the same name.
+    /// Whether the field reuses the bytes of the previous field, under the same name.
     pub repeats: bool,
     /// The commands that its values pick.
     pub commands: Option<FieldCommands>,
-    /// It is the coil of Modbus function 5, which is FF for 1.
+    /// Whether it is the coil of Modbus function 5, which is FF for 1.
     pub is_coil: bool,
-    /// Its `offset` is written, also if it is 0.
+    /// Whether the file has an `offset`, even if it is 0.
     pub has_offset: bool,
-    /// The port whose health it shows, if that is not the port that sends it.
+    /// The port whose health the field shows, if not the port that sends it.
     pub of_port: Option<String>,
-    /// What it may send: limits, or the entries of a table.
+    /// Limits of the sent value, or the entries of a table.
     pub sendable: Vec<FieldSpec>,
 }
 
 impl DeviceField {
-    /// A field with a name, empty if it needs none, and nothing beside its `spec`.
+    /// A field with a name, empty if it needs none, and nothing but its `spec`.
     pub const fn new(name: String, spec: FieldSpec) -> Self {
         Self {
             name,
@@ -172,7 +171,7 @@ impl DeviceField {
 pub struct FieldCommands {
     /// When a value takes effect.
     pub when: CommandWhen,
-    /// First and last value, and the command; an empty one is that of idle values.
+    /// First and last value, and the command, which is empty for idle values.
     pub entries: Vec<(i64, i64, String)>,
 }
 
@@ -180,7 +179,7 @@ impl NamedFrame {
     /// Lays out the frame.
     ///
     /// # Errors
-    /// None for a frame from a file: reading the file laid it out.
+    /// Never for a frame from a file: reading the file has laid it out.
     pub fn lay_out(&self, carrier: Carrier, part: Direction) -> Result<DeviceFrame, LayoutError> {
         let specs: Vec<_> = self.fields.iter().map(|field| field.spec).collect();
         DeviceFrame::new(carrier, part, (&self.head, &self.tail), &specs)

@@ -61,8 +61,8 @@ pub enum Function {
 }
 
 impl Function {
-    /// Every function with the name used in files. Of several at one instant the first comes first: those that
-    /// stop before those that start.
+    /// Every function with its name in files. Of several functions at one instant the first is executed first: those
+    /// that stop come before those that start.
     pub const ALL: [(&str, Self); 7] = [
         ("disable", Self::Disable),
         ("stop", Self::Stop),
@@ -112,8 +112,8 @@ impl ShownState {
 }
 
 impl InitialTarget {
-    /// The bit of a system variable that this is; `None` for the tool's buttons and for what is no bit. Of an
-    /// output that can be commanded it is the command's bit.
+    /// The bit of a system variable that this names; `None` for the tool's buttons and for items that are not bits. For
+    /// an output that can be commanded, the command's bit.
     pub fn var_bit(self) -> Option<VarBit> {
         match self {
             Self::VarBit(bit) => Some(bit),
@@ -127,8 +127,8 @@ impl InitialTarget {
         self == other || self.var_bit().is_some_and(|bit| Some(bit) == other.var_bit())
     }
 
-    /// Whether it can trigger a function: a functional input, a functional bool register input, or a button
-    /// of the tool.
+    /// Whether the item can trigger a function: a functional input, a functional bool register input, or a button of
+    /// the tool.
     pub fn triggers_functions(self) -> bool {
         match self.var_bit() {
             Some(VarBit { var, .. }) => match var.group() {
@@ -140,7 +140,7 @@ impl InitialTarget {
         }
     }
 
-    /// Whether it can show a state: a functional output, or a functional bool register output.
+    /// Whether the item can show a state: a functional output, or a functional bool register output.
     pub fn shows_states(self) -> bool {
         self.var_bit().is_some_and(|VarBit { var, .. }| match var.group() {
             "BitOutputReg" => var.index() <= 2,

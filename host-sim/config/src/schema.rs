@@ -1,8 +1,8 @@
 //! The JSON Schema of a file, for editors and linters.
 //!
-//! In: the tables of [`keys`](crate::keys). Out: a schema of draft 7 that takes every file that the reader takes. It
-//! has no `null`, which TOML does not have; a key that another case has is `false` there, so that an editor points at
-//! it. What depends on names, on sizes and on other parts of the file it does not know.
+//! In: the tables of [`keys`](crate::keys). Out: a schema of draft 7 that accepts every file that the reader accepts.
+//! It has no `null`, which TOML does not have. A key of another case is `false`, so that an editor points at it. Does
+//! not know what depends on names, sizes or other parts of the file.
 
 use serde_json::{Map, Value, json};
 
@@ -73,7 +73,7 @@ impl Schema {
         }
     }
 
-    /// A table by its name; it is made once.
+    /// The definition of a table by its name, which is made once.
     fn defined(&mut self, table: &KeyTable) -> Value {
         let name = table.name.replace(' ', "-");
         if !self.definitions.contains_key(&name) {
@@ -85,7 +85,7 @@ impl Schema {
 
     fn key(&mut self, key: &Key) -> Value {
         let mut value = self.shape(&key.shape);
-        // What stands beside a reference does not count.
+        // Keywords beside a reference are ignored.
         if value.get("$ref").is_some() {
             return value;
         }
@@ -103,7 +103,7 @@ impl Schema {
         let mut object = Map::new();
         object.insert("type".into(), json!("object"));
         object.insert("additionalProperties".into(), json!(false));
-        // An editor offers all keys; those of another case are refused below.
+        // Lists all keys, which an editor offers; the keys of other cases are refused below.
         let mut properties = Map::new();
         for key in table.keys() {
             let value = self.key(key);
@@ -118,7 +118,7 @@ impl Schema {
                 }
             }
         }
-        // A common key stands for all cases, which may only narrow it.
+        // A common key is valid in all cases, which may only narrow it.
         for key in table.common {
             properties.insert(key.name.into(), self.key(key));
         }
@@ -135,7 +135,7 @@ impl Schema {
         object
     }
 
-    /// The cases, each behind those before it.
+    /// The cases, each in the `else` of the previous one.
     fn cases(&mut self, table: &KeyTable, cases: &[Case], all: &Map<String, Value>) -> Option<Value> {
         let (case, rest) = cases.split_first()?;
         let mut own = Map::new();
@@ -167,7 +167,7 @@ impl Schema {
     }
 }
 
-/// What two cases of a key have in common: what it is, as far as an editor must know it.
+/// What two cases of a key have in common, as far as an editor needs it.
 fn either(one: &Value, other: &Value) -> Value {
     let kind = |value: &Value| match value.get("$ref") {
         Some(_) => json!("object"),
@@ -245,7 +245,7 @@ fn depend<'k>(object: &mut Map<String, Value>, keys: impl Iterator<Item = &'k Ke
     }
 }
 
-/// Its meaning, with its unit.
+/// The meaning of a key, with its unit.
 fn describe(key: &Key) -> String {
     let text = plain(key.text);
     match (key.unit, text.as_str()) {
@@ -270,7 +270,7 @@ fn of_text(text: TextKind) -> Value {
     match text {
         TextKind::Any => json!({ "type": "string" }),
         TextKind::Length(least, usize::MAX) => json!({ "type": "string", "minLength": least }),
-        // Bytes, of which a character can have several; the reader counts them.
+        // The length is in bytes, and a character can have several bytes; the reader counts them.
         TextKind::Length(least, most) => json!({ "type": "string", "minLength": least, "maxLength": most }),
         TextKind::Name => {
             json!({ "type": "string", "minLength": 1, "maxLength": 32, "pattern": "^[^ \"=\\t\\r\\n]+$" })
@@ -296,7 +296,7 @@ fn list(item: Value, least: usize, most: usize) -> Value {
     list
 }
 
-/// Without a fraction where there is none.
+/// A number, without a fraction if it is whole.
 fn number(value: f64) -> Value {
     if value.fract() == 0.0 { json!(value as i64) } else { json!(value) }
 }

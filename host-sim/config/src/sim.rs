@@ -1,4 +1,4 @@
-//! The simulated controller's configuration: a controller file after it was checked.
+//! The configuration of the simulated controller: a checked controller file.
 
 use std::net::{IpAddr, Ipv4Addr};
 
@@ -31,7 +31,7 @@ pub struct SimConfig {
 /// Addresses of the controller's servers; port 0 means any free port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Listen {
-    /// The address all of them listen on.
+    /// The address of all servers.
     pub address: IpAddr,
     /// Command port, 2000.
     pub command: u16,

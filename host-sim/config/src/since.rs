@@ -1,7 +1,7 @@
-//! What a gateway file of version 0.2 means now, where that has changed.
+//! What a gateway file of version 0.2 means now, where its meaning has changed.
 //!
-//! In: the configuration, and its recipes as frames. Out: sentences, each with the key it is about. A key that 0.2 did
-//! not have says that its subject was decided since, so nothing is told of that.
+//! In: the configuration, and its recipes as frames. Out: sentences, each with its key. A key that 0.2 did not have
+//! shows that the author knows the new meaning, so nothing is reported for it.
 
 use proto_core::command::{Action, Keyword, Request};
 use proto_core::config::{
@@ -13,10 +13,10 @@ use proto_core::wire::can::CanId;
 
 use crate::device::{DeviceField, DeviceRecipe, NamedExchange, NamedFrame};
 
-/// What is told, and the key that it is about.
+/// The key, and the sentence about it.
 type Placed = (Vec<String>, String);
 
-/// What means something else than in version 0.2, in the order of the ports. `recipes` are the recipes of the file, as
+/// What has another meaning than in version 0.2, in the order of the ports. `recipes` are the recipes of the file as
 /// [`load_frames`](crate::file::load_frames) reads them.
 pub fn changes_since_0_2(config: &GatewayConfig, recipes: &[Option<DeviceRecipe>]) -> Vec<Placed> {
     let mut told = Vec::new();
@@ -28,7 +28,7 @@ pub fn changes_since_0_2(config: &GatewayConfig, recipes: &[Option<DeviceRecipe>
         changes.echo();
         changes.presence();
         changes.late();
-        // Of a recipe that the controller can have too, a frame is rejected as a whole, as before.
+        // Frames of recipes that the controller can have too are still rejected as a whole.
         let frames = frames.filter(|_| config.view().is_device(recipe));
         for (nth, frame) in (1..).zip(frames.iter().flat_map(|frames| &frames.input)) {
             changes.rejected_fields(nth, frame);
@@ -50,7 +50,7 @@ struct PortChanges<'a> {
 }
 
 impl PortChanges<'_> {
-    /// Of `key` in the recipe.
+    /// Reports a change at `key` of the recipe.
     fn tell(&mut self, key: &[&str], said: &str) {
         let place = key.iter().map(|key| format!(", {key}")).collect::<String>();
         let path = ["recipe", &self.recipe.name].into_iter().chain(key.iter().copied());
@@ -58,14 +58,14 @@ impl PortChanges<'_> {
         self.told.push((path.map(str::to_owned).collect(), message));
     }
 
-    /// Of `key` in the exchange with this index.
+    /// Reports a change at `key` of the exchange with this index.
     fn tell_of(&mut self, nth: usize, key: &str, said: &str) {
         let (recipe, number) = (self.recipe.name.to_string(), (nth + 1).to_string());
         let path = ["recipe", &recipe, "exchange", &number, key].map(str::to_owned).to_vec();
         self.told.push((path, format!("port {:?}, exchange {number}, {key}: {said}", self.port.name)));
     }
 
-    /// Replies of port 2000.
+    /// Changes of replies of port 2000.
     fn commands(&mut self) {
         let changes = |table: Span| {
             table.of(&self.config.commands).iter().any(|command| {
@@ -108,7 +108,7 @@ impl PortChanges<'_> {
         }
     }
 
-    /// A frame of the input part, counted from 1.
+    /// Changes of a frame of the input part; `nth` counts from 1.
     fn rejected_fields(&mut self, nth: usize, frame: &NamedFrame) {
         if let Some(said) = self.rejects(frame, self.port.timeout) {
             match frame.id {
@@ -118,7 +118,7 @@ impl PortChanges<'_> {
         }
     }
 
-    /// Which fields of a frame are rejected alone; `None` if there is nothing else in it that could be taken.
+    /// Which fields of a frame are rejected alone; `None` if no other field of the frame could be accepted.
     fn rejects(&self, frame: &NamedFrame, timeout: Duration) -> Option<String> {
         let used = |field: &&DeviceField| !field.repeats && is_used(&field.spec);
         let rejected = frame.fields.iter().filter(used).filter(|field| may_be_rejected(field));
@@ -166,7 +166,7 @@ impl PortChanges<'_> {
             );
             self.tell_of(nth, "on", &said);
         }
-        // What the file has for events is 0 without the key, and for states 1.
+        // Without the key, the file's value is 0 for events and 1 for states.
         let has_no_retries = exchange.retries == 1 && exchange.event_retries == 0;
         let is_changed = exchange.is_start_event() || exchange.is_event() && exchange.follow.is_none();
         if is_changed && exchange.is_answered() && has_no_retries {
@@ -205,7 +205,7 @@ impl PortChanges<'_> {
         }
     }
 
-    /// How long late replies are awaited: those that look alike, and all the others together.
+    /// Reports the waits for late replies: for each group that looks alike, and together for all others.
     fn late(&mut self) {
         let mut alone = Vec::new();
         for (nth, exchange) in self.exchanges.iter().enumerate() {
@@ -250,7 +250,7 @@ impl PortChanges<'_> {
         }
     }
 
-    /// What one exchange that is never answered means for the others of its device.
+    /// How an exchange that is never answered affects the other exchanges of its device.
     fn presence(&mut self) {
         let answered = |peer: u8| {
             let of_peer = move |one: &&Exchange| one.peer == peer && one.is_answered();
@@ -275,7 +275,7 @@ fn numbers(indices: impl Iterator<Item = usize>) -> String {
     indices.map(|nth| (nth + 1).to_string()).collect::<Vec<_>>().join(", ")
 }
 
-/// Whether anything is made of an input field.
+/// Whether an input field is used for anything.
 fn is_used(field: &FieldSpec) -> bool {
     match field {
         FieldSpec::UserInput { to, .. } | FieldSpec::DeviceInput { to, .. } => {
@@ -286,8 +286,8 @@ fn is_used(field: &FieldSpec) -> bool {
     }
 }
 
-/// Whether a field can have what does not fit its variable or is no number. One with limits, a map or another rule was
-/// looked at since 0.2, which had none.
+/// Whether a field can have a value that does not fit its variable or is not a number. A field with limits, a map or
+/// another rule has been edited since 0.2, which had none of these.
 fn may_be_rejected(field: &DeviceField) -> bool {
     let may_be = match &field.spec {
         FieldSpec::DeviceInput { encoding, to: InputBinding::Variable { .. }, .. } => {
@@ -300,7 +300,7 @@ fn may_be_rejected(field: &DeviceField) -> bool {
     may_be && field.sendable.is_empty()
 }
 
-/// Whether it asks a node of CANopen for an object, and the file does not say what a refusal is.
+/// Whether the exchange requests an object from a CANopen node, and the file does not say what a refusal is.
 fn is_sdo_without_refusal(exchange: &NamedExchange) -> bool {
     let id = |frame: &Option<NamedFrame>| match frame.as_ref()?.id {
         Some(CanId::Standard(id)) => Some(id),

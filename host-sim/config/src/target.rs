@@ -85,8 +85,8 @@ impl BitGroup {
         }
     }
 
-    /// The bit of a system variable that holds `index`, from 1; `None` for the buttons and for an index that
-    /// is not there. Of an output it is the command's bit.
+    /// The bit of a system variable that holds `index`, from 1; `None` for the buttons and for an index that does not
+    /// exist. For an output, the command's bit.
     pub fn var_bit(self, index: u8) -> Option<VarBit> {
         let nth = index.checked_sub(1).filter(|_| index <= self.count())?;
         let byte = u32::from(nth / 8);

@@ -41,7 +41,7 @@ fn read_send(item: &TableValue<'_>) -> Result<SendOn> {
     Ok(SendOn::Rising { var, bit })
 }
 
-/// `rising:BitOutputReg[3].0`; `others` are allowed too.
+/// `rising:BitOutputReg[3].0`; `others` names further allowed texts.
 pub(super) fn read_rising(item: &TableValue<'_>, text: &str, others: &str) -> Result<(SysVar, u8)> {
     let Some(place) = text.strip_prefix("rising:") else {
         return Err(
@@ -89,7 +89,7 @@ fn read_to(field: &TableReader<'_>, to: &TableValue<'_>) -> Result<InputBinding>
     Ok(InputBinding::Variable { var: read_var(to)?, scale, offset })
 }
 
-/// `counter = true` or `counter = { max = 14 }`: the number behind which the counter is 0 again.
+/// `counter = true` or `counter = { max = 14 }`: the number after which the counter restarts at 0.
 pub(super) fn read_counter(field: &TableReader<'_>, encoding: &Encoding) -> Result<Option<u32>> {
     let Some(item) = field.optional("counter") else { return Ok(None) };
     let (low, high) = encoding.range();

@@ -1,6 +1,6 @@
 //! `checksum` of a frame in a gateway file.
 //!
-//! In: its table, and the fields of the frame so far. Out: a checksum among the fields, at its place.
+//! In: the table, and the fields of the frame so far. Out: the fields with the checksum at its place.
 
 use proto_core::config::FieldSpec;
 use proto_core::device::{Algorithm, Checksum, Crc, DataId, Element, MAX_DATA_ID, TextWidth};
@@ -12,7 +12,7 @@ use super::names::meant_checksum;
 use super::reader::{Result, TableReader, TableValue};
 use crate::keys::device::{self, CHECKSUM_FORMS, CHECKSUM_ORDERS, DATA_ID_PLACES};
 
-/// Reads the checksum of a frame and puts it at its place among the fields.
+/// Reads the checksum of a frame and inserts it at its place among the fields.
 pub(super) fn read_checksum(frame: &TableReader<'_>, head: usize, fields: &mut Vec<FileField>) -> Result<()> {
     let Some(item) = frame.optional("checksum") else { return Ok(()) };
     if item.as_string().is_some() {
@@ -114,7 +114,7 @@ fn read_covered(item: &TableValue<'_>) -> Result<(u16, Option<u16>)> {
 /// The number of fields before the byte that `item` names.
 fn find_place(item: &TableValue<'_>, head: usize, fields: &[FileField]) -> Result<usize> {
     let at: usize = item.integer(device::AT.integers())?;
-    // Places between two fields; behind one of varying length no byte has a number.
+    // Places between two fields; bytes after a field of variable length have no number.
     let mut places = Vec::new();
     let mut offset = Some(head);
     for (nth, field) in fields.iter().enumerate() {

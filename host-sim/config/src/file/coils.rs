@@ -1,8 +1,6 @@
-//! The fields of coils: one bit each, without a type, packed into bytes with the first in the lowest
-//! bit.
+//! The fields of coils: one bit each, without a type, packed into bytes from the lowest bit up.
 //!
-//! In: the list of fields of an exchange or a block of Modbus. Out: [`FileField`]s that share bytes,
-//! and how many coils they are.
+//! In: the list of fields of a Modbus exchange or block. Out: [`FileField`]s that share bytes, and the number of coils.
 
 use proto_core::config::FieldSpec;
 use proto_core::device::{Bits, ByteOrder, Encoding, Kind, Overflow};
@@ -14,14 +12,14 @@ use super::model::FileField;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys::field::{self, PAD_COILS};
 
-/// Coils, as they are read.
+/// Coils read so far.
 struct Packer {
     fields: Vec<FileField>,
     /// Coils so far.
     count: usize,
-    /// Bytes that have fields or padding.
+    /// Number of bytes that have fields or padding.
     bytes: usize,
-    /// The newest pad, for bytes that have nothing else.
+    /// The newest padding, for bytes that have nothing else.
     padded: Option<Spot>,
 }
 

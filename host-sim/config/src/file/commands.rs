@@ -1,7 +1,7 @@
 //! The command table of an input field in a gateway file.
 //!
-//! In: `commands`, and the keys that say when a value picks a command. Out: ranges of values, and
-//! what each of them picks.
+//! In: `commands`, and the keys that say when a value picks a command. Out: ranges of values, and the command that each
+//! picks.
 
 use proto_core::config::CommandWhen;
 
@@ -9,10 +9,10 @@ use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::device::FieldCommands;
 use crate::keys::field::{BASES, IDLE, WHEN, WHENS};
 
-/// What the values of a field pick, and when, with the places of the entries.
+/// The commands of a field, and the places of the entries.
 pub(super) type FileCommands = (FieldCommands, Vec<Spot>);
 
-/// First and last value, the command, and its place; an empty command for values that pick nothing.
+/// First and last value, the command, and its place; the command is empty for values that pick nothing.
 type FileCommand = ((i64, i64, String), Spot);
 
 fn with_places(when: CommandWhen, entries: Vec<FileCommand>) -> FileCommands {
@@ -20,7 +20,7 @@ fn with_places(when: CommandWhen, entries: Vec<FileCommand>) -> FileCommands {
     (FieldCommands { when, entries }, spots)
 }
 
-/// An edge or a level of a field with one bit, instead of a value.
+/// An edge or a level of a one-bit field, instead of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum BitKey {
     Rising,
@@ -97,13 +97,13 @@ fn read_bit(field: &TableReader<'_>, table: &TableReader<'_>, keys: &[BitKey]) -
         None => CommandWhen::Change,
     };
     if keys == [BitKey::Falling] {
-        // At rest the bit is set.
+        // The bit is set in the idle state.
         entries.push(((1, 1, String::new()), table.spot.clone()));
     }
     Ok(with_places(when, entries))
 }
 
-/// `base`, if the field's base survives silence.
+/// `base`, if the field's base survives a timeout.
 fn keeps_base<'a>(field: &TableReader<'a>) -> Result<Option<TableValue<'a>>> {
     let Some(item) = field.optional("base") else { return Ok(None) };
     let keeps = item.choice(&BASES)?;
@@ -114,7 +114,7 @@ fn bit_key(key: &str) -> Option<BitKey> {
     BIT_KEYS.into_iter().find(|(name, _)| *name == key).map(|(_, key)| key)
 }
 
-/// `bits = 3`, `bits = "3..3"`, or a coil, which has no type; what else is wrong with it, its own reader says.
+/// `bits = 3`, `bits = "3..3"`, or a coil, which has no type. Other mistakes are left to the reader of `bits`.
 fn has_one_bit(field: &TableReader<'_>) -> bool {
     let Some(item) = field.optional("bits") else { return field.optional("type").is_none() };
     match item.as_string() {
@@ -159,7 +159,7 @@ fn read_text(item: &TableValue<'_>) -> Result<String> {
     }
 }
 
-/// What is written of other programs' commands, and what is meant.
+/// Corrects commands written in the syntax of other programs.
 fn misspelled(text: &str) -> Option<String> {
     let text = text.trim();
     if let Some((word @ ("run" | "speed"), argument)) = text.split_once([' ', '\t', '=', ':'])
@@ -196,7 +196,7 @@ mod tests {
             [(1, 1, "stop".into()), (-5, 16, "speed({value})".into()), (255, 255, String::new())].to_vec();
         assert_eq!(field(text), Ok((entries, CommandWhen::Kept)));
         assert_eq!(field("commands = { 1 = 'stop' }\nbase = 'reset'").unwrap().1, CommandWhen::Change);
-        // As a controller reads them.
+        // These are spelled as a controller reads them.
         for text in ["run (pick.jspf)", "run(\"pick it.jspf\" , 50)", "run(it's.jspf)"] {
             let entries = field(&format!("commands = {{ 1 = \"\"\"{text}\"\"\" }}")).unwrap().0;
             assert_eq!(entries, [(1, 1, text.to_owned())]);

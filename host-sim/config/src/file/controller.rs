@@ -177,7 +177,7 @@ fn read_port(table: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<(SimPort
     Ok((SimPort { name, bus, recipe, cycle: table.time_or(&CYCLE)? }, name_spot))
 }
 
-/// Which port takes which recipe (D16, D18).
+/// Checks that a port can carry its recipe (D16, D18).
 fn check_recipe(kind: BusKind, recipe: &FileRecipe) -> std::result::Result<(), String> {
     let name = &recipe.name;
     let is_can_port = kind == BusKind::Can;

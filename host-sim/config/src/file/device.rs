@@ -1,7 +1,7 @@
 //! Frames of devices in a gateway file: fields beyond the plain types.
 //!
-//! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames that were laid out.
-//! The controller's own recipes have none of these keys, and are refused them with the reason.
+//! In: the tables of a part and of its fields. Out: [`FileField`]s, and frames with their layouts. The controller's own
+//! recipes have none of these keys; they are refused with the reason.
 
 use proto_core::config::{Constants, DeviceFrame, FieldSpec, InputBinding, OutputBinding};
 use proto_core::device::{Boundary, Carrier, Encoding, LayoutError, Overflow};
@@ -21,7 +21,7 @@ use crate::keys::field::{self, EQUALS, FILL, OVERFLOW, OVERFLOWS, PAD};
 use crate::keys::frame::{OF_FRAME, OF_STREAM};
 use crate::keys::{Key, names};
 
-/// Why recipes of this kind have no frames of devices; `None` if they may.
+/// Why recipes of this kind cannot have device frames; `None` if they can.
 fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
     match (flavour, mode) {
         (Flavour::Gateway, Mode::User) => None,
@@ -36,13 +36,12 @@ fn why_plain(mode: Mode, flavour: Flavour) -> Option<&'static str> {
     }
 }
 
-/// The keys of a stream part or a CAN frame, beside those of any recipe; refuses them where there
-/// are none.
+/// The keys of a stream part or a CAN frame beyond those of any recipe; refuses them where they are not allowed.
 pub(super) fn frame_keys(table: &TableReader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
     own_keys(OF_FRAME, table, mode, flavour)
 }
 
-/// The same for a stream part.
+/// As [`frame_keys`], for a stream part.
 pub(super) fn stream_keys(table: &TableReader<'_>, mode: Mode, flavour: Flavour) -> Result<&'static [Key]> {
     own_keys(OF_STREAM, table, mode, flavour)
 }
@@ -70,7 +69,7 @@ pub(super) fn refuse_in_can_part(part: &TableReader<'_>, mode: Mode, flavour: Fl
     )
 }
 
-/// What the fields of one frame have in common, while they are read.
+/// What the fields of a frame have in common, while they are read.
 pub(super) struct FieldReader {
     direction: Direction,
     flavour: Flavour,
@@ -83,13 +82,13 @@ impl FieldReader {
         Ok(Self { direction: rules.direction, flavour, order: FieldOrder::read(frame)?, open: None })
     }
 
-    /// Fields in registers of Modbus.
+    /// Fields in Modbus registers.
     pub(super) fn of_registers(exchange: &TableReader<'_>, direction: Direction) -> Result<Self> {
         let order = FieldOrder::of_registers(exchange)?;
         Ok(Self { direction, flavour: Flavour::Gateway, order, open: None })
     }
 
-    /// Reads one field of a user recipe, which can be several items of the frame.
+    /// Reads one field of a user recipe, which may become several items of the frame.
     pub(super) fn read(&mut self, item: &TableValue<'_>, fields: &mut Vec<FileField>) -> Result<()> {
         let table = item.any_table()?;
         let mut push = |name, spec| fields.push(FileField::new(item.spot.clone(), name, spec));
@@ -175,7 +174,7 @@ impl FieldReader {
     }
 }
 
-/// The keys of what a value is for; refuses those of the other direction.
+/// The keys that say what a value is for; refuses those of the other direction.
 pub(super) fn binding_keys(table: &TableReader<'_>, direction: Direction) -> Result<&'static [Key]> {
     match direction {
         Direction::Input => {
@@ -194,7 +193,7 @@ fn refuse_bindings(table: &TableReader<'_>) -> Result<()> {
     refuse(table, &bindings, "a field with equals is a constant and has nothing else")
 }
 
-/// An integer that must match.
+/// Reads an integer that must match.
 pub(super) fn read_constant(
     table: &TableReader<'_>,
     spot: &Spot,
@@ -211,7 +210,7 @@ pub(super) fn read_constant(
     Ok(FileField::new(spot.clone(), name, FieldSpec::Fixed { encoding, value }))
 }
 
-/// A field with its binding, or two if its bytes are used twice.
+/// A field with its binding, or two fields if its bytes are used twice.
 pub(super) fn bind(
     table: &TableReader<'_>,
     direction: Direction,
@@ -272,7 +271,7 @@ fn bind_input(
     let mut rules = input_rules::read(table, encoding, overflow, to)?;
     let mut restarted = input_rules::read_restarted(table, &encoding)?;
     let picks = commands.is_some().then_some(InputBinding::Unused);
-    // Commands come first where no variable does.
+    // Without a variable, commands come first.
     let uses = if to.is_some() { [to, counter, picks] } else { [picks, counter, None] };
     let uses: Vec<_> = uses.into_iter().flatten().collect();
     let uses = if uses.is_empty() { vec![InputBinding::Unused] } else { uses };
@@ -289,7 +288,7 @@ fn bind_input(
             (field.named.commands, field.commands) = (Some(commands), spots);
         }
         fields.push(field);
-        // Those of the variable, which is the first.
+        // The rules of the variable, which is the first use.
         fields.append(&mut rules);
     }
     Ok(())
@@ -315,7 +314,7 @@ fn read_text<'a>(item: &TableValue<'a>) -> Result<impl Iterator<Item = u8> + use
 }
 
 impl FilePart {
-    /// Whether something else than its fields tells where frames end.
+    /// Whether something other than the fields marks the end of a frame.
     fn ends(&self) -> FrameEnds {
         let (boundary, escape) = self.framing;
         FrameEnds { boundary, escape }
@@ -384,7 +383,7 @@ impl FilePart {
 }
 
 impl FileFrame {
-    /// Whether a constant tells it from `other`, which has the same id.
+    /// Whether a constant distinguishes the frame from `other`, which has the same id.
     fn differs(&self, other: &Self, part: Direction) -> bool {
         let constants = |frame: &Self| {
             let specs: Vec<_> = frame.fields.iter().map(FileField::spec).collect();
@@ -395,7 +394,7 @@ impl FileFrame {
 }
 
 impl FileRecipe {
-    /// Whether frames of a part have one id.
+    /// Whether several frames of a part have the same id.
     fn repeats_ids(&self) -> bool {
         let repeats = |part: &FilePart| {
             let ids = || part.frames.iter().map(|frame| frame.id);
@@ -406,13 +405,13 @@ impl FileRecipe {
             && [&self.input, &self.output].into_iter().flatten().any(repeats)
     }
 
-    /// Whether it sends a frame without data.
+    /// Whether a frame without data is sent.
     fn sends_empty(&self) -> bool {
         let frames = self.output.iter().flat_map(|part| &part.frames);
         self.is_can() && self.mode == Mode::User && frames.into_iter().any(|frame| frame.fields.is_empty())
     }
 
-    /// Whether it has frames that no recipe of the controller has.
+    /// Whether the recipe has frames that no recipe of the controller can have.
     pub(super) fn is_device(&self) -> bool {
         let parts = [&self.input, &self.output].into_iter().flatten();
         let mut fields = parts.flat_map(|part| &part.frames).flat_map(|frame| &frame.fields);

@@ -1,7 +1,6 @@
 //! A TOML text and its overrides as one tree, with the place of everything in it.
 //!
-//! In: text, and `KEY=VALUE` overrides. Out: tables in file order. Does not know the keys of any
-//! file.
+//! In: text, and `KEY=VALUE` overrides. Out: tables in file order. Does not know the keys of any file.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -36,7 +35,7 @@ pub(super) struct TreeNode {
 #[derive(Debug, Clone)]
 pub(super) enum TreeValue {
     Str(String),
-    /// A 64-bit integer of TOML, or the text of one that does not fit.
+    /// A 64-bit integer of TOML, or the text of an integer that does not fit.
     Int(Result<i64, String>),
     Float(f64),
     Bool(bool),
@@ -46,7 +45,7 @@ pub(super) enum TreeValue {
 }
 
 impl TreeValue {
-    /// With an article, for messages.
+    /// The name of the kind with its article, for messages.
     pub(super) fn kind(&self) -> &'static str {
         match self {
             Self::Str(_) => "a string",
@@ -183,7 +182,7 @@ fn convert(node: &Spanned<DeValue<'_>>, at: &dyn Fn(usize) -> At) -> TreeNode {
         DeValue::Integer(number) => TreeValue::Int(
             i64::from_str_radix(number.as_str(), number.radix()).map_err(|_| number.to_string()),
         ),
-        // TOML's floats are Rust's, apart from underscores, which the parser has removed.
+        // TOML's floats are Rust's, except for underscores, which the parser has removed.
         DeValue::Float(number) => TreeValue::Float(number.as_str().parse().unwrap_or(f64::NAN)),
         DeValue::Boolean(value) => TreeValue::Bool(*value),
         DeValue::Datetime(_) => TreeValue::Datetime,
@@ -193,8 +192,8 @@ fn convert(node: &Spanned<DeValue<'_>>, at: &dyn Fn(usize) -> At) -> TreeNode {
     TreeNode { at: at(node.span().start), value }
 }
 
-/// The value of an override: TOML if it looks like TOML, else the text itself, so that
-/// `controller.address=10.0.0.2` needs no quotes, which a shell would remove.
+/// The value of an override: TOML if it looks like TOML, else the text itself. `controller.address=10.0.0.2` thus needs
+/// no quotes, which a shell would remove.
 fn parse_value(text: &str, at: At) -> Result<TreeNode, String> {
     match DeValue::parse(text) {
         Ok(value) => Ok(convert(&value, &|_| at)),
@@ -206,7 +205,7 @@ fn parse_value(text: &str, at: At) -> Result<TreeNode, String> {
     }
 }
 
-/// The end of a message about a place in a list where a hexadecimal byte lacks its mark, such as `[48, AA]`.
+/// The end of a message about a list in which a hexadecimal byte lacks its `0x`, such as `[48, AA]`.
 fn hexadecimal(text: &str, place: Option<usize>) -> String {
     let Some((before, after)) = place.and_then(|place| text.split_at_checked(place)) else {
         return String::new();

@@ -1,4 +1,4 @@
-//! How one field of a device's frame is written: the keys of its type, its byte order and its bits.
+//! The encoding of one field of a device's frame: its type, byte order and bits.
 //!
 //! In: a field's table, and the byte order of its part. Out: an [`Encoding`].
 
@@ -10,7 +10,7 @@ use super::reader::{Result, TableReader, TableValue};
 use crate::keys::device::{ENDIAN, ORDERS, WORD_ORDER, WORD_ORDERS};
 use crate::keys::field::{DECIMALS, OWN_TYPES, SIGNED, Type};
 
-/// The byte order that a part or a field asks for.
+/// The byte order given by a part or a field.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct FieldOrder {
     is_big: Option<bool>,
@@ -26,12 +26,12 @@ impl FieldOrder {
         })
     }
 
-    /// The order of fields in registers of Modbus, whose bytes are big-endian.
+    /// The order of fields in Modbus registers, whose bytes are big-endian.
     pub(super) fn of_registers(exchange: &TableReader<'_>) -> Result<Self> {
         Ok(Self { is_big: Some(true), ..Self::read(exchange)? })
     }
 
-    /// The order of a number of `len` bytes; `self` is the field's, `part` the one around it.
+    /// The order of a number of `len` bytes; `self` is the field's order, `part` that of its part.
     fn of(self, part: Self, len: usize) -> ByteOrder {
         let is_big = self.is_big.or(part.is_big).unwrap_or(false);
         let low_word_first = self.low_word_first.or(part.low_word_first).unwrap_or(!is_big);
@@ -45,12 +45,12 @@ impl FieldOrder {
     }
 }
 
-/// The number whose bits the fields before have.
+/// The number that the previous bit fields belong to.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OpenNumber {
     bytes: u8,
     order: ByteOrder,
-    /// The bits of its bytes; those of the first byte are the lowest.
+    /// The used bits of the number's bytes; the first byte is the lowest.
     taken: u64,
 }
 
@@ -82,8 +82,8 @@ fn read_type_item<'a>(field: &TableReader<'a>) -> Result<TableValue<'a>> {
     field.required("type", "byte, char, word, short, dword, int, float or double")
 }
 
-/// How a field is written. `open` is the number of bits that the field before belongs to, then that
-/// of this field.
+/// The encoding of a field. `open` is the number of bits that the previous field belongs to, and is set to that of this
+/// field.
 pub(super) fn read(
     field: &TableReader<'_>,
     part: FieldOrder,
@@ -98,7 +98,7 @@ pub(super) fn read(
         let is_new = field.optional("new").map(|item| item.bool()).transpose()?;
         let ones = places(&bits, order);
         let shared = before.filter(|open| {
-            // Bits in another order belong to the same bytes only where that is said.
+            // Bits in another byte order share the same bytes only if the file says so.
             let may_share = is_new.map_or(open.order == order, |is_new| !is_new);
             may_share && open.bytes == bits.bytes && open.taken & ones == 0
         });
@@ -113,7 +113,7 @@ pub(super) fn read(
     Ok(Encoding { order: read_order(field, part, len)?, ..encoding })
 }
 
-/// The bits in the bytes of their number, the first byte the lowest.
+/// The bits in the bytes of their number; the first byte is the lowest.
 fn places(bits: &Bits, order: ByteOrder) -> u64 {
     let ones = (u64::MAX >> (64 - u32::from(bits.count))) << bits.first;
     let mut bytes = [0; 8];
@@ -153,7 +153,7 @@ fn read_kind(field: &TableReader<'_>, ty: Type) -> Result<Kind> {
                 (Some(item), Width::Until(_)) => item.integer(DECIMALS.integers())?,
                 (Some(item), Width::Fixed(width)) => {
                     let decimals: u8 = item.integer(DECIMALS.integers())?;
-                    // A sign, a digit and a point stand before the decimals.
+                    // A sign, a digit and a point come before the decimals.
                     if decimals > 0 && width < decimals + 3 {
                         let least = decimals + 3;
                         return Err(item.error(format!(

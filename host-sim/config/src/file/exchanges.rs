@@ -1,7 +1,7 @@
-//! `[[recipe.exchange]]`: what is asked of devices, what they reply, and when.
+//! `[[recipe.exchange]]`: requests to devices, their replies, and when they are sent.
 //!
-//! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s, whose frames were laid out. The
-//! frames here are a device's own; those of Modbus are in `modbus`.
+//! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s with laid out frames. The frames here are a
+//! device's own; those of Modbus are in `modbus`.
 
 use proto_core::config::{
     Exchange, ExchangeError, ExchangeKey, InputBinding, OutcomeTo, Port, Restarted, Triggers,
@@ -130,7 +130,7 @@ pub(super) fn read_overdue(table: &TableReader<'_>, key: &str) -> Result<Option<
     }
 }
 
-/// The places of all keys of an exchange; that of the exchange for keys that it does not have.
+/// The places of all keys of an exchange; for a key that is absent, the place of the exchange.
 pub(super) fn spots(table: &TableReader<'_>, own: &[(&str, ExchangeKey)]) -> Vec<(ExchangeKey, Spot)> {
     let timing = [
         ("every_ms", ExchangeKey::Every),
@@ -149,7 +149,7 @@ pub(super) fn spots(table: &TableReader<'_>, own: &[(&str, ExchangeKey)]) -> Vec
     keys.chain([(ExchangeKey::Whole, table.spot.clone())]).collect()
 }
 
-/// The field of a reply that tells of a restart; its place is added to `spots`.
+/// The field of a reply that reports a restart; its place is added to `spots`.
 pub(super) fn restarted(
     table: &TableReader<'_>,
     reply: Option<&FilePart>,
@@ -169,7 +169,7 @@ pub(super) fn restarted(
     Ok(Some(Restarted { field: u8::try_from(nth).unwrap_or(u8::MAX), value: *value }))
 }
 
-/// Elsewhere nothing tells of a restart.
+/// Refuses a restart number where it has no effect.
 pub(super) fn refuse_restarted(table: &TableReader<'_>, part: Option<&FilePart>) -> Result<()> {
     let fields = part.into_iter().flat_map(|part| part.frames.iter().flat_map(|frame| &frame.fields));
     match fields.filter_map(|field| field.restarted.as_ref()).next() {
@@ -178,7 +178,7 @@ pub(super) fn refuse_restarted(table: &TableReader<'_>, part: Option<&FilePart>)
     }
 }
 
-/// A request, a reply, a pending answer or a refusal, and whether it is a remote frame.
+/// Reads a request, a reply, a pending reply or a refusal, and whether it is a remote frame.
 fn read_frame(
     item: &TableValue<'_>,
     key: &str,
@@ -219,7 +219,7 @@ fn read_frame(
     Ok((part, false))
 }
 
-/// A pending answer or a refusal has values, and nothing else.
+/// Checks that a pending reply or a refusal has only values.
 fn check_refusal(table: &TableReader<'_>, part: &FilePart) -> Result<()> {
     refuse_restarted(table, Some(part))?;
     let is_other = |field: &&FileField| {
@@ -233,7 +233,7 @@ fn check_refusal(table: &TableReader<'_>, part: &FilePart) -> Result<()> {
 }
 
 impl FilePart {
-    /// A part, or the frame of an exchange, still without anything but its place.
+    /// A part, or the frame of an exchange, with nothing but its place.
     pub(super) fn new(table: &TableReader<'_>) -> Self {
         Self {
             spot: table.spot.clone(),
@@ -265,8 +265,7 @@ impl FileFrame {
     }
 }
 
-/// When an exchange is asked, how long it may take, and how often it is repeated; `names` are those of all exchanges of
-/// the recipe.
+/// When an exchange is requested, its timeouts, and its repetitions; `names` are those of all exchanges of the recipe.
 pub(super) fn read_settings(
     table: &TableReader<'_>,
     peer: u8,
@@ -299,7 +298,7 @@ pub(super) fn check_asked(table: &TableReader<'_>, settings: &Exchange) -> Resul
     if settings.is_never() { Err(table.error(ExchangeError::Never)) } else { Ok(()) }
 }
 
-/// The number of the exchange with a name.
+/// The number of the exchange with this name.
 fn read_follow(item: &TableValue<'_>, names: &[Option<String>]) -> Result<u8> {
     let name = item.string()?;
     let nth = names.iter().position(|other| other.as_deref() == Some(name));
@@ -313,7 +312,7 @@ fn read_follow(item: &TableValue<'_>, names: &[Option<String>]) -> Result<u8> {
     })
 }
 
-/// The variables that tell what became of events.
+/// The variables that report the outcome of events.
 fn read_outcome(item: &TableValue<'_>) -> Result<OutcomeTo> {
     let table = item.table(&exchange::OUTCOME_TABLE)?;
     let variable = |key| -> Result<Option<SysVar>> {

@@ -46,7 +46,7 @@ pub(super) fn read_bytes(table: &TableReader<'_>, key: &str) -> Result<(Vec<u8>,
     Ok((bytes, Some(item.spot)))
 }
 
-/// The fields of a stream part, or of one CAN frame, behind a head of so many bytes.
+/// The fields of a stream part, or of one CAN frame, after a head of this many bytes.
 pub(super) fn read_fields(
     table: &TableReader<'_>,
     head: usize,

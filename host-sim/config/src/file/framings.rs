@@ -1,4 +1,4 @@
-//! What tells one frame from the next in a gateway file, texts, and lengths.
+//! Reads how frames are separated in a gateway file, texts, and lengths.
 //!
 //! In: the tables of a part and of its fields. Out: the configuration's own types.
 
@@ -16,9 +16,9 @@ use crate::keys::field::{ALL_COUNTS, COUNTS, PLUS, TEXT_IN, TEXT_ORDER, TEXT_ORD
 
 /// The keys of a stream part.
 pub(super) const PART_KEYS: [&str; 2] = ["framing", "escape"];
-/// The keys of a text, beside those that other fields have.
+/// The keys of a text beyond those of other fields.
 pub(super) const TEXT_KEYS: [&str; 5] = ["length_to", "count_to", "length_from", "order", "ignore"];
-/// Those of a length.
+/// The keys of a length.
 pub(super) const LENGTH_KEYS: [&str; 3] = ["length", "counts", "plus"];
 
 /// `framing` and `escape` of a stream part.
@@ -100,7 +100,7 @@ fn read_ignored(item: &TableValue<'_>, width: TextWidth) -> Result<Ignored> {
     })
 }
 
-/// A field with `length = true`, which is written like this.
+/// A field with `length = true` and this encoding.
 pub(super) fn read_length(field: &TableReader<'_>, encoding: Encoding) -> Result<FieldSpec> {
     let item = field.required("length", "true, for the field that tells the frame's length")?;
     if !item.bool()? {

@@ -35,10 +35,10 @@ pub(super) fn read(root: &TableReader<'_>, programs: &[SimProgram]) -> Result<Fu
     Ok(Functions { inputs, outputs, start })
 }
 
-/// Which items a table takes.
+/// The items that a table accepts.
 struct Items {
     takes: fn(InitialTarget) -> bool,
-    /// What others cannot do.
+    /// What other items cannot do.
     does: &'static str,
     allowed: &'static str,
 }

@@ -59,7 +59,7 @@ pub(super) fn read(document: &SourceTree) -> Result<Box<GatewayConfig>> {
 }
 
 impl BusKind {
-    /// A recipe of Modbus and its line go together.
+    /// Checks that Modbus recipes are used on Modbus lines, and only there.
     fn check_modbus(self, recipe: &FileRecipe) -> std::result::Result<(), String> {
         let wanted = match self {
             Self::ModbusMaster | Self::ModbusTcp => Some(RecipeKind::ModbusMaster),
@@ -83,12 +83,12 @@ impl BusKind {
     }
 }
 
-/// The configuration so far, and what it is made from.
+/// The configuration so far, and its sources.
 struct Assembly<'a> {
     root: &'a TableReader<'a>,
     recipes: &'a [FileRecipe],
     ports: &'a [TableReader<'a>],
-    /// Those of all ports, also of those that have not been added yet.
+    /// Names of all ports, including those that have not been added yet.
     port_names: Vec<String>,
     config: Box<GatewayConfig>,
     /// The places of the configuration's commands, and of its safe values.
@@ -101,7 +101,7 @@ impl Assembly<'_> {
         spot.error(self.root.document, message)
     }
 
-    /// A mistake that the configuration's own checks have found.
+    /// An error of the configuration's own checks, with its place in the file.
     fn refused(&self, ConfigError { place, kind }: ConfigError) -> FileError {
         let message = self.config.view().describe_kind(kind).to_string();
         match self.spot(place) {
@@ -126,7 +126,7 @@ impl Assembly<'_> {
         let item = table.required("recipe", "the name of a recipe of this file")?;
         let recipe = &recipes[recipes::find(recipes, &item)?];
         kind.check_modbus(recipe).map_err(|message| item.error(message))?;
-        // The check of the whole configuration refuses kinds of recipes that the bus does not take.
+        // The check of the whole configuration refuses kinds of recipes that the bus does not support.
         if matches!(kind, BusKind::Rs485 | BusKind::TcpListen) && !recipe.is_can() {
             recipe.check_framing(Framing::Bytes).map_err(|message| item.error(message))?;
         }
@@ -251,7 +251,7 @@ fn read_controller(root: &TableReader<'_>, recipes: &[FileRecipe]) -> Result<Con
             let is_set = |spot: &Spot| matches!(spot.at, At::Override(_));
             let link_is_set = table.optional(LINK_UDP.name).is_some_and(|item| is_set(&item.spot));
             match udp_item.filter(|_| port != udp_port) {
-                // What is set for this run counts.
+                // An override for this run wins.
                 Some(item) if is_set(&item.spot) && !link_is_set => {}
                 Some(item) if is_set(&item.spot) == link_is_set => {
                     return Err(item.error(format!(
@@ -311,7 +311,7 @@ fn read_bus(table: &TableReader<'_>, kind: BusKind) -> Result<Bus> {
     })
 }
 
-/// Where the devices of Modbus TCP are: a host, and perhaps a port.
+/// The address of the devices of Modbus TCP: a host, and optionally a port.
 fn read_modbus_tcp(table: &TableReader<'_>) -> Result<Bus> {
     let item = table.required("to", "the device's IP address or host name, such as \"192.168.1.50\"")?;
     let text = item.string()?;
@@ -337,7 +337,7 @@ fn read_modbus_tcp(table: &TableReader<'_>) -> Result<Bus> {
     Ok(Bus::ModbusTcp { host: bounded(host), port })
 }
 
-/// Read with the same limit.
+/// A string that was read with the same limit.
 fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
     heapless::String::try_from(text).unwrap_or_default()
 }

@@ -1,6 +1,7 @@
-//! What becomes of the value of an input field: `as`, `min`, `max` and `outside`, `map`, `no_value`, `valid_to`, `point`.
+//! How the value of an input field is processed: `as`, `min`, `max` and `outside`, `map`, `no_value`, `valid_to`,
+//! `point`.
 //!
-//! In: the field's table, its encoding, its variable. Out: what stands behind the field in the configuration.
+//! In: the field's table, its encoding, its variable. Out: the rules that follow the field in the configuration.
 
 use proto_core::config::{FieldSpec, InputBinding, InputRule, MapEntry, NO_TEXT, NoText, check_read};
 use proto_core::device::{Encoding, Kind, Overflow};
@@ -16,7 +17,7 @@ use super::sendable::{add_entry, behind, read_limits};
 use crate::keys::field::{AS, AS_WORDS, POINT, POINTS, RESTARTED, RULES_IN};
 use crate::keys::names;
 
-/// What stands behind an input field, with the places of their keys.
+/// The rules that follow an input field, with the places of their keys.
 pub(super) fn read(
     table: &TableReader<'_>,
     encoding: Encoding,
@@ -78,7 +79,7 @@ pub(super) fn read(
     Ok(rules)
 }
 
-/// The number that tells that the device has restarted.
+/// The number that reports that the device has restarted.
 pub(super) fn read_restarted(table: &TableReader<'_>, encoding: &Encoding) -> Result<Option<(Spot, f64)>> {
     let Some(item) = table.optional(RESTARTED.name) else { return Ok(None) };
     Ok(Some((item.spot.clone(), read_number(&item, encoding)?)))

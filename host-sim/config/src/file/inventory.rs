@@ -1,6 +1,6 @@
-//! An inventory: the gateways of a person who looks after several.
+//! An inventory: the gateways that a person looks after.
 //!
-//! In: a TOML file with `[[gateway]]`. Out: names, addresses and key files; what an address is, its user knows. Keys
+//! In: a TOML file with `[[gateway]]`. Out: names, addresses and key files. Does not know the form of an address. Keys
 //! are files, never text in the inventory.
 
 use std::path::{Path, PathBuf};
@@ -18,16 +18,16 @@ pub struct Listed {
     pub name: String,
     /// Its address.
     pub address: String,
-    /// The address that it knows itself by, if that is another one, as behind a forwarded port.
+    /// The address that the gateway knows itself by, if it is different, as behind a forwarded port.
     pub host: Option<String>,
-    /// The file with its key, relative to the inventory's folder; `None` if it is only read.
+    /// The file with its key, relative to the inventory's folder; `None` for read-only access.
     pub key: Option<PathBuf>,
 }
 
-/// Most gateways of a file.
+/// Maximum number of gateways.
 const MAX: usize = 10_000;
 
-/// Reads an inventory. `check` says what is wrong with an address, also with that of `host`.
+/// Reads an inventory. `check` returns what is wrong with an address, and is also called for `host`.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -43,7 +43,7 @@ pub fn load_inventory(
     Ok(listed)
 }
 
-/// Same, from a text; files of keys are as the text has them.
+/// As [`load_inventory`], from a text; the paths of key files stay as they are.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -83,7 +83,7 @@ pub fn parse_inventory(
     Ok(listed)
 }
 
-/// A text with at least one character and at most so many bytes.
+/// A text of at least one character and at most `max` bytes.
 pub(super) fn text_of(item: &TableValue<'_>, max: usize) -> std::result::Result<String, FileError> {
     let text = item.string()?;
     match text.len() {

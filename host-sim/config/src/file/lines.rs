@@ -5,7 +5,7 @@ use proto_core::config::{PortKey, Rs485};
 use super::reader::{Result, TableReader};
 use crate::keys::gateway::{BAUD, IDLE_GAP, PARITIES, PARITY, STOP_BITS, TURNAROUND};
 
-/// The settings of a serial line, within their ranges; `usual` makes the default silences.
+/// The settings of a serial line, within their ranges; `usual` sets the default silences.
 pub(super) fn read_line(port: &TableReader<'_>, usual: fn(Rs485) -> Rs485) -> Result<Rs485> {
     let mut line = usual(Rs485 {
         baud: port.integer_or(&BAUD)?,
@@ -37,7 +37,7 @@ pub(super) fn key_name(key: PortKey) -> &'static str {
         PortKey::Bitrate => "bitrate",
         PortKey::Listen => "listen",
         PortKey::To => "to",
-        // A mistake without a key of its own concerns the port as a whole.
+        // A mistake without its own key concerns the port as a whole.
         _ => "name",
     }
 }

@@ -100,8 +100,8 @@ pub fn load_recipes(path: &Path, overrides: &[String]) -> Result<Vec<AnyRecipe>>
     with_text(path, |text| parse_recipes(text, overrides))
 }
 
-/// Reads the recipes of a file of either kind as frames with the names and bindings of their fields,
-/// those too that the controller can have; `None` for a recipe of system variables.
+/// Reads the recipes of a file of either kind as frames with the names and bindings of their fields, including recipes
+/// that the controller can have; `None` for a recipe of system variables.
 ///
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
@@ -109,7 +109,7 @@ pub fn load_frames(path: &Path, overrides: &[String]) -> Result<Vec<Option<Devic
     with_text(path, |text| parse_frames(text, overrides))
 }
 
-/// Same as [`load`], from a text.
+/// As [`load`], from a text.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -124,7 +124,7 @@ pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Config> {
     }
 }
 
-/// Same as [`load_gateway`], from a text.
+/// As [`load_gateway`], from a text.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -140,7 +140,7 @@ pub fn parse_gateway(text: Text<'_>, overrides: &[String]) -> Result<Box<Gateway
     gateway::read(&document)
 }
 
-/// Same as [`load_controller`], from a text.
+/// As [`load_controller`], from a text.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -154,7 +154,7 @@ pub fn parse_controller(text: Text<'_>, overrides: &[String]) -> Result<SimConfi
     controller::read(&document)
 }
 
-/// Same as [`load_recipes`], from a text.
+/// As [`load_recipes`], from a text.
 ///
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
@@ -162,7 +162,7 @@ pub fn parse_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<AnyReci
     Ok(read_recipes(text, overrides)?.iter().map(FileRecipe::named).collect())
 }
 
-/// Same as [`load_frames`], from a text.
+/// As [`load_frames`], from a text.
 ///
 /// # Errors
 /// The first mistake in any of the recipes, with its place.
@@ -183,13 +183,13 @@ fn read_recipes(text: Text<'_>, overrides: &[String]) -> Result<Vec<FileRecipe>>
     recipes::read_all(&root, flavour).map_err(|error| name_kind(&document, error))
 }
 
-/// A mistake found after the file was read, at the place of `key` (names; an item of an array by
-/// its `name`), or at the nearest place that exists.
+/// An error found after the file was read, at the place of `key` or at the nearest place that exists. `key` consists of
+/// names; an item of an array is given by its `name`.
 pub fn error_at(path: &Path, overrides: &[String], key: &[&str], message: impl ToString) -> FileError {
     with_text(path, |text| Ok(error_in(text, overrides, key, message))).unwrap_or_else(|error| error)
 }
 
-/// Same as [`error_at`], in a text.
+/// As [`error_at`], in a text.
 pub fn error_in(text: Text<'_>, overrides: &[String], key: &[&str], message: impl ToString) -> FileError {
     let message = message.to_string();
     match SourceTree::parse(text.name, text.toml, overrides) {
@@ -201,10 +201,10 @@ pub fn error_in(text: Text<'_>, overrides: &[String], key: &[&str], message: imp
     }
 }
 
-/// What `read` makes of the text of a file.
+/// Calls `read` with the text of a file.
 ///
 /// # Errors
-/// If the file cannot be read, and those of `read`.
+/// If the file cannot be read, or the errors of `read`.
 pub fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Result<T> {
     let name = path.display().to_string();
     match std::fs::read_to_string(path) {
@@ -217,7 +217,7 @@ pub fn with_text<T>(path: &Path, read: impl FnOnce(Text<'_>) -> Result<T>) -> Re
     }
 }
 
-/// A gateway file has a `[controller]`. A controller file has not, and may leave out all sections of its own.
+/// A gateway file has a `[controller]`. A controller file has none, and may omit all of its own sections.
 fn kind_of(document: &SourceTree) -> Result<Flavour> {
     match (document.root.get("controller").is_some(), has_own_section(document)) {
         (true, false) => Ok(Flavour::Gateway),
@@ -229,12 +229,12 @@ fn kind_of(document: &SourceTree) -> Result<Flavour> {
     }
 }
 
-/// Whether it has a section that only controller files have.
+/// Whether the file has a section that only controller files have.
 fn has_own_section(document: &SourceTree) -> bool {
     ["listen", "robot", "initial", "program"].iter().any(|key| document.root.get(key).is_some())
 }
 
-/// A mistake in a file of which nothing but the missing `[controller]` says that it is a controller's.
+/// Adds a hint to an error in a file that is taken for a controller file only because `[controller]` is missing.
 fn name_kind(document: &SourceTree, mut error: FileError) -> FileError {
     if document.root.get("controller").is_none() && !has_own_section(document) {
         error.message += " (without [controller] it is read as a controller file; a gateway file has that)";

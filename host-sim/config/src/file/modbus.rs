@@ -1,8 +1,7 @@
 //! Modbus RTU in a gateway file: the exchanges of a master, and the blocks of a slave.
 //!
-//! In: `[[recipe.exchange]]` of `kind = "modbus-rtu"` and `[[recipe.block]]` of
-//! `kind = "modbus-rtu-slave"`. Out: [`FileExchange`]s. The numbers of registers and coils follow
-//! from the fields.
+//! In: `[[recipe.exchange]]` of `kind = "modbus-rtu"` and `[[recipe.block]]` of `kind = "modbus-rtu-slave"`. Out:
+//! [`FileExchange`]s. The numbers of registers and coils follow from the fields.
 
 use proto_core::config::{DeviceFrame, ExchangeError, ExchangeKey, register_bits};
 use proto_core::device::Carrier;
@@ -171,7 +170,7 @@ fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
     })
 }
 
-/// The address of the first register or coil. Manuals' numbers of six digits are no addresses.
+/// The address of the first register or coil. The six-digit numbers of manuals are not addresses.
 fn read_first(item: &TableValue<'_>, table: Table) -> Result<u16> {
     item.integer(exchange::ADDRESS.integers()).map_err(|mut error| {
         let number = item.as_integer().and_then(|number| u32::try_from(number).ok());
@@ -182,7 +181,7 @@ fn read_first(item: &TableValue<'_>, table: Table) -> Result<u16> {
     })
 }
 
-/// Who writes the block: a master, whose values go to the robot, or the gateway.
+/// Who writes the block: a master, with values for the robot, or the gateway.
 fn direction_of(block: &TableReader<'_>, holds: Table) -> Result<Direction> {
     let list = block.required("fields", "the list of the block's fields")?;
     let mut found: Option<Direction> = None;
@@ -216,7 +215,7 @@ fn direction_of(block: &TableReader<'_>, holds: Table) -> Result<Direction> {
     }))
 }
 
-/// By name or by number, with counts of 1.
+/// Reads a function given by name or by number, with counts of 1.
 fn read_function(table: &TableReader<'_>) -> Result<Operation> {
     let item = table.required("function", "such as \"read-input-registers\", or its number, 4")?;
     let number = match item.as_integer() {
@@ -234,7 +233,7 @@ fn is_of_coils(table: Table) -> bool {
     matches!(table, Table::Coils | Table::DiscreteInputs)
 }
 
-/// Fields, and the registers or coils that they are.
+/// A list of fields, and their number of registers or coils.
 struct List<'a> {
     item: TableValue<'a>,
     part: FilePart,
@@ -258,7 +257,7 @@ impl<'a> List<'a> {
         if !is_coils { list.with_registers(direction) } else { Ok(list) }
     }
 
-    /// The bits of a register that have a field.
+    /// The bits of a register that have fields.
     fn bits(&self) -> u16 {
         register_bits(&self.part.fields().iter().map(FileField::spec).collect::<Vec<_>>())
     }
@@ -299,7 +298,7 @@ fn read_registers(
     Ok((fields, 0))
 }
 
-/// Counts and addresses that the function allows.
+/// Checks the counts and addresses against the limits of the function.
 fn check(
     table: &TableReader<'_>,
     operation: &Operation,

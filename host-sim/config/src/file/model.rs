@@ -1,6 +1,6 @@
-//! What is read of a gateway's or a controller's recipes, with the places of what later checks refuse.
+//! The recipes of a file as they were read, with places for the errors of later checks.
 //!
-//! It knows neither the keys nor how they are read.
+//! Does not know the keys or how they are read.
 
 use proto_core::config::{Exchange, ExchangeKey, FieldSpec, OnStale, SendOn, Transaction, Triggers};
 use proto_core::device::{Boundary, Escape};
@@ -26,9 +26,9 @@ pub(super) struct FileRecipe {
     pub(super) kind: RecipeKind,
     pub(super) input: Option<FilePart>,
     pub(super) output: Option<FilePart>,
-    /// What is asked of devices beside the parts, or all that a recipe of Modbus has.
+    /// Exchanges beside the parts, or everything that a Modbus recipe has.
     pub(super) exchanges: Vec<FileExchange>,
-    /// What requests do while a value of them is stale, if there is no output part to say it.
+    /// What requests do while one of their values is stale, if no output part says it.
     pub(super) on_stale: Option<OnStale>,
 }
 
@@ -38,11 +38,11 @@ pub(super) struct FilePart {
     pub(super) tail: Vec<u8>,
     pub(super) head_spot: Option<Spot>,
     pub(super) tail_spot: Option<Spot>,
-    /// One in a stream part, one for each id in a CAN part.
+    /// One frame in a stream part, one for each id in a CAN part.
     pub(super) frames: Vec<FileFrame>,
     /// The gateway's keys of an output part.
     pub(super) sending: Sending,
-    /// What tells the frames of a stream apart.
+    /// How the frames of a stream are separated.
     pub(super) framing: (Boundary, Option<Escape>),
 }
 
@@ -52,19 +52,19 @@ pub(super) struct FileFrame {
     pub(super) id: CanId,
     pub(super) id_spot: Spot,
     pub(super) fields: Vec<FileField>,
-    /// Of an output frame on CAN.
+    /// Only of an output frame on CAN.
     pub(super) order: FrameOrder,
 }
 
-/// A field with its name, and the places of what later checks refuse.
+/// A field with its name, and places for the errors of later checks.
 pub(super) struct FileField {
     pub(super) spot: Spot,
     pub(super) named: DeviceField,
     /// The places of its commands.
     pub(super) commands: Vec<Spot>,
-    /// The place of the name of another port.
+    /// The place of another port's name.
     pub(super) port: Option<Spot>,
-    /// The number that tells that the device has restarted.
+    /// The number that reports that the device has restarted.
     pub(super) restarted: Option<(Spot, f64)>,
 }
 
@@ -75,7 +75,7 @@ impl FileField {
         Self { spot, named, commands: Vec::new(), port: None, restarted: None }
     }
 
-    /// The field as the configuration has it, still without its commands and without the number of another port.
+    /// The field as in the configuration, but without its commands and the number of another port.
     pub(super) fn spec(&self) -> FieldSpec {
         self.named.spec
     }
@@ -84,26 +84,26 @@ impl FileField {
 /// One exchange, or one block of a slave.
 pub(super) struct FileExchange {
     pub(super) spot: Spot,
-    /// The places of its keys, for later checks.
+    /// The places of the keys, for later checks.
     pub(super) spots: Vec<(ExchangeKey, Spot)>,
-    /// As in the configuration, but for its frames and repetitions.
+    /// As in the configuration, except for frames and repetitions.
     pub(super) settings: Exchange,
     pub(super) retries: Option<u8>,
     pub(super) kind: ExchangeKind,
-    /// What goes to the device. Of Modbus: its registers or coils only, without a frame around them.
+    /// The frame to the device. On Modbus only registers or coils, without a frame around them.
     pub(super) output: Option<FilePart>,
-    /// What comes from it.
+    /// The frame from the device.
     pub(super) input: Option<FilePart>,
     pub(super) pending: Option<FilePart>,
     pub(super) refusal: Option<FilePart>,
-    /// Its frames are on a CAN bus.
+    /// Whether the frames are on a CAN bus.
     pub(super) is_can: bool,
-    /// The request is a remote frame on CAN.
+    /// Whether the request is a remote frame on CAN.
     pub(super) remote: bool,
 }
 
 impl FileExchange {
-    /// Settings of what is never asked.
+    /// Settings of an exchange that is never requested.
     pub(super) const fn never(peer: u8) -> Exchange {
         Exchange::new(
             peer,
@@ -121,7 +121,7 @@ pub(super) struct Sending {
     pub(super) send_spot: Option<Spot>,
 }
 
-/// What a frame is called, and which one goes before it.
+/// The name of a frame, and the frame that goes before it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct FrameOrder {
     pub(super) name: Option<(String, Spot)>,

@@ -1,10 +1,10 @@
-//! Names that were probably meant: near spellings, and what other tools and manuals call the same.
+//! Suggestions for misspelled names: similar spellings, and the terms of other tools and manuals.
 //!
-//! In: what a file has, and the names that are known. Out: the end of a message, empty if nothing is near.
+//! In: a name in a file, and the known names. Out: the end of a message, empty if no name is similar.
 
 use proto_core::sysvar::SysVar;
 
-/// `; did you mean "x"?` with the name of `names` that is nearest.
+/// `; did you mean "x"?` with the nearest of `names`.
 pub(super) fn did_you_mean<'n>(given: &str, names: impl Iterator<Item = &'n str>) -> String {
     let near = names.map(|name| (distance(given, name), name)).min();
     match near {
@@ -13,21 +13,21 @@ pub(super) fn did_you_mean<'n>(given: &str, names: impl Iterator<Item = &'n str>
     }
 }
 
-/// Letters that are wrong, missing, too many, or swapped with the next. A unit that was left out is one mistake.
+/// Number of wrong, missing, extra or swapped letters. A missing unit counts as one mistake.
 fn distance(given: &str, name: &str) -> usize {
     let whole = strsim::osa_distance(given, name);
     let bare = name.rsplit_once('_').filter(|(_, unit)| matches!(*unit, "ms" | "us"));
     bare.map_or(whole, |(bare, _)| whole.min(1 + strsim::osa_distance(given, bare)))
 }
 
-/// The same for a key, which other tools may call something else.
+/// As [`did_you_mean`] for a key, which may have another name in other tools.
 pub(super) fn meant_key(given: &str, names: &[&str]) -> String {
     let given_plain = plain(given);
     let is_alias = |(others, _): &&(&str, &str)| others.split(' ').any(|other| other == given_plain);
     if let Some((_, name)) = KEYS.iter().filter(is_alias).find(|(_, name)| names.contains(name)) {
         return ask(name);
     }
-    // The ports of the controller are in a table of their own.
+    // The controller's ports are in a table of their own.
     let service = given_plain.strip_suffix("port").filter(|_| names.contains(&"ports"));
     match service.filter(|service| matches!(*service, "command" | "state" | "modbus" | "udp2011")) {
         Some(service) => format!("; write ports = {{ {service} = ... }}"),
@@ -35,7 +35,7 @@ pub(super) fn meant_key(given: &str, names: &[&str]) -> String {
     }
 }
 
-/// The same for the group of a system variable, in a name such as `RobotStat[8]`.
+/// As [`did_you_mean`] for the group of a system variable, in a name such as `RobotStat[8]`.
 pub(super) fn meant_variable(given: &str) -> String {
     let pendant = given.strip_prefix("__").and_then(|rest| Some(rest.rsplit_once('_')?.0));
     let group = pendant.unwrap_or_else(|| given.split('[').next().unwrap_or(given));
@@ -45,16 +45,16 @@ pub(super) fn meant_variable(given: &str) -> String {
     did_you_mean(group, SysVar::all().map(SysVar::group))
 }
 
-/// The same for the type of a field.
+/// As [`did_you_mean`] for the type of a field.
 pub(super) fn meant_type(given: &str, names: &[&str]) -> String {
     meant(given, names, &TYPES)
 }
 
-/// The same for a checksum.
+/// As [`did_you_mean`] for a checksum.
 pub(super) fn meant_checksum(given: &str, names: &[&str]) -> String {
     let given = plain(given);
     let bare = given.strip_prefix("crc").unwrap_or(&given);
-    // `MODBUS`, `CRC-MODBUS` and `CCITT-FALSE` leave out what the known names begin with.
+    // `MODBUS`, `CRC-MODBUS` and `CCITT-FALSE` omit the beginning of the known names.
     let ends_so = |name: &str| {
         let (_, last) = name.split_once('-').unwrap_or((name, ""));
         !last.is_empty() && plain(last) == bare
@@ -65,7 +65,7 @@ pub(super) fn meant_checksum(given: &str, names: &[&str]) -> String {
     }
 }
 
-/// What is spelled the same but for signs and capitals, else an alias, else the nearest.
+/// A name that differs only in signs and capitals, else an alias, else the nearest name.
 fn meant(given: &str, names: &[&str], aliases: &[(&str, &str)]) -> String {
     let given_plain = plain(given);
     if let Some(name) = names.iter().find(|name| plain(name) == given_plain) {
@@ -88,7 +88,7 @@ fn plain(name: &str) -> String {
     name.chars().filter(char::is_ascii_alphanumeric).map(|c| c.to_ascii_lowercase()).collect()
 }
 
-/// What others call the keys.
+/// Names of the keys in other tools.
 const KEYS: [(&str, &str); 7] = [
     ("baudrate bps bitrate speed", "baud"),
     ("baudrate baud bps speed", "bitrate"),
@@ -99,7 +99,7 @@ const KEYS: [(&str, &str); 7] = [
     ("extendedid isextended ext", "extended"),
 ];
 
-/// What others call the types. Where a name means several, or there is none, what to write.
+/// Names of the types in other tools. If a name has several meanings or none here: what to write.
 const TYPES: [(&str, &str); 15] = [
     ("i8 int8 s8 sint signedchar", "char"),
     ("u8 uint8 usint unsignedchar octet", "byte"),
@@ -121,7 +121,7 @@ const TYPES: [(&str, &str); 15] = [
     ("bool boolean bit bits", "write type = \"byte\", bits = 0 for a single bit"),
 ];
 
-/// What others call the checksums.
+/// Names of the checksums in other tools.
 const CHECKSUMS: [(&str, &str); 13] = [
     ("crc crc16 16", "write \"crc16-modbus\" or \"crc16-arc\", which differ in how they begin"),
     ("ibm crcibm crc16ibm crc16lha lha", "crc16-arc"),

@@ -21,7 +21,7 @@ pub(super) fn read(table: &TableReader<'_>) -> Result<Network> {
     Ok(Network { address, prefix, router: optional("router")?, dns: optional("dns")? })
 }
 
-/// Refuses what looks like an IPv4 address and is none: a name service would be asked for it, in vain.
+/// Refuses a text that looks like an IPv4 address and is not: a name service would be asked for it in vain.
 pub(super) fn check_ipv4(text: &str) -> std::result::Result<(), String> {
     let last = text.trim_end_matches('.').rsplit('.').next().unwrap_or("");
     let ends_in_number = !last.is_empty() && last.bytes().all(|byte| byte.is_ascii_digit());

@@ -1,7 +1,7 @@
-//! In which order the output frames of a CAN recipe are sent.
+//! The order in which the output frames of a CAN recipe are sent.
 //!
-//! In: the frames as the file has them, with `name` and `after`. Out: the same frames, each behind the one that
-//! it is to follow. The gateway hands a whole cycle over at once, in this order.
+//! In: the frames in file order, with `name` and `after`. Out: the same frames, each after the frame that it follows.
+//! The gateway sends a whole cycle at once, in this order.
 
 use super::model::{FileFrame, FrameOrder};
 use super::names::did_you_mean;
@@ -24,7 +24,7 @@ impl FrameOrder {
     }
 }
 
-/// Puts each frame behind the one that it names. Otherwise the order of the file stays.
+/// Puts each frame after the frame that it names. Otherwise keeps the order of the file.
 ///
 /// # Errors
 /// What is wrong with a name, and where.
@@ -73,11 +73,11 @@ fn names_before(frames: &[FileFrame], nth: usize) -> impl Iterator<Item = &str> 
     frames.iter().take(nth).filter_map(|frame| frame.order.name())
 }
 
-/// What is wrong with frames that all wait for each other: those from the first of them back to it.
+/// The error about frames that wait for each other in a circle.
 fn circle(waiting: &[FileFrame]) -> (Spot, String) {
     let mut names: Vec<&str> = Vec::new();
     let mut at = waiting.first();
-    // Every one of these waits for another of them, so it ends where a name comes again.
+    // Each of these waits for another of them, so the circle closes where a name repeats.
     while let Some(after) = at.and_then(|frame| frame.order.after())
         && !names.contains(&after)
     {
@@ -89,6 +89,6 @@ fn circle(waiting: &[FileFrame]) -> (Spot, String) {
     let circle: Vec<_> = circle.map(|name| format!("{name:?}")).collect();
     let spot = at.or(waiting.first()).and_then(|frame| frame.order.after.clone()).map(|(_, spot)| spot);
     let message = format!("{} is a circle; allowed: one of them without after", circle.join(" after "));
-    // A frame that waits has `after`.
+    // A waiting frame has `after`.
     (spot.unwrap_or_else(|| waiting[0].spot.clone()), message)
 }

@@ -1,4 +1,4 @@
-//! Typed access to a [`SourceTree`]: every error has the place and the whole key.
+//! Typed access to a [`SourceTree`]. Every error has its place and the whole key.
 
 use std::ops::RangeInclusive;
 
@@ -48,7 +48,7 @@ impl<'a> TableReader<'a> {
         Ok(reader)
     }
 
-    /// Refuses a key that the table does not have, or not beside the word of the key that its cases depend on.
+    /// Refuses a key that the table does not have, or that does not belong to the selected case of the table.
     pub(super) fn check(&self, table: &keys::KeyTable) -> Result<()> {
         let by = table.by().and_then(|by| Some((by, self.optional(by)?.as_string()?)));
         match by {
@@ -63,14 +63,14 @@ impl<'a> TableReader<'a> {
         }
     }
 
-    /// Refuses a key that is not in these lists; `when` says what they depend on.
+    /// Refuses a key that is not in these lists; `when` says what the lists depend on.
     pub(super) fn check_keys(&self, allowed: &[&[Key]], when: &str) -> Result<()> {
         let names = keys::names(allowed.iter().copied().flatten());
         self.check_names(&names, when, |_| false)
     }
 
-    /// Refuses a key without one of the names, and says which of them was probably meant. A key that `is_known`
-    /// is none that was misspelled.
+    /// Refuses a key that is not one of the names, and suggests the nearest name. A key that `is_known` is not
+    /// misspelled.
     pub(super) fn check_names(
         &self,
         allowed: &[&str],
@@ -96,12 +96,12 @@ impl<'a> TableReader<'a> {
     /// The value of `key`, if it is present.
     pub(super) fn optional(&self, key: &str) -> Option<TableValue<'a>> {
         let entry = self.table.get(key)?;
-        // An array of tables has no place of its own; its values do.
+        // An array of tables has no place of its own, only its values have.
         let spot = Spot { at: entry.node.at, key: self.path(key) };
         Some(TableValue { document: self.document, spot, node: &entry.node })
     }
 
-    /// The value of `key`, which must be present; `what` says what it should be.
+    /// The value of `key`, which must be present; `what` describes it.
     pub(super) fn required(&self, key: &str, what: &str) -> Result<TableValue<'a>> {
         self.optional(key).ok_or_else(|| self.error(format!("{key} is missing; {what}")))
     }
@@ -116,7 +116,7 @@ impl<'a> TableReader<'a> {
         })
     }
 
-    /// The tables of the array `key`, with any keys, each with its name or its number.
+    /// The tables of the array `key`, with any keys, each with its name or number.
     pub(super) fn any_tables(&self, key: &str) -> Result<Vec<TableReader<'a>>> {
         let Some(item) = self.optional(key) else { return Ok(Vec::new()) };
         let items = item.array(&format!("of tables, written [[{key}]]"))?;
@@ -139,7 +139,7 @@ impl<'a> TableReader<'a> {
         }
     }
 
-    /// An integer that must be there; `what` says what it is.
+    /// An integer that must be present; `what` describes it.
     pub(super) fn integer_needed<T: TryFrom<i64>>(&self, key: &Key, what: &str) -> Result<T> {
         self.required(key.name, what)?.integer(key.integers())
     }
@@ -166,12 +166,12 @@ impl<'a> TableReader<'a> {
         }
     }
 
-    /// What the word of a key stands for; `None` if it is absent.
+    /// The value of a key's word; `None` if the key is absent.
     pub(super) fn word<T: Clone>(&self, key: &Key, choices: &[(&str, T)]) -> Result<Option<T>> {
         self.optional(key.name).map(|item| item.choice(choices)).transpose()
     }
 
-    /// What the word of a key stands for, or its default.
+    /// The value of a key's word, or of its default.
     pub(super) fn word_or<T: Clone>(&self, key: &Key, choices: &[(&str, T)]) -> Result<T> {
         let default = match key.need {
             Need::Word(word) => choices.iter().find(|(name, _)| *name == word),
@@ -210,7 +210,7 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// The string, if it is one.
+    /// The value, if it is a string.
     pub(super) fn as_string(&self) -> Option<&'a str> {
         match &self.node.value {
             TreeValue::Str(text) => Some(text),
@@ -225,7 +225,7 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// The value as true or false, if it is a bool.
+    /// The value, if it is a bool.
     pub(super) fn as_bool(&self) -> Option<bool> {
         match self.node.value {
             TreeValue::Bool(value) => Some(value),
@@ -233,7 +233,7 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// The integer, if it is one.
+    /// The value, if it is an integer.
     pub(super) fn as_integer(&self) -> Option<i64> {
         match self.node.value {
             TreeValue::Int(Ok(value)) => Some(value),
@@ -241,7 +241,7 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// 0 or 1, false or true.
+    /// A bit: 0 or 1, false or true.
     pub(super) fn bit(&self) -> Result<bool> {
         match self.as_bool() {
             Some(bit) => Ok(bit),
@@ -288,7 +288,7 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// A span of time within the limits of its key; fractions are rounded to the microsecond.
+    /// A duration within the limits of its key; fractions are rounded to the microsecond.
     pub(super) fn time(&self, key: &Key) -> Result<Duration> {
         let (value, limits) = (self.number()?, key.limits());
         match keys::time(key, value) {
@@ -319,7 +319,7 @@ impl<'a> TableValue<'a> {
         matches!(self.node.value, TreeValue::Table(_))
     }
 
-    /// A table with the keys of its kind.
+    /// A table with the keys of this kind.
     pub(super) fn table(&self, table: &keys::KeyTable) -> Result<TableReader<'a>> {
         let reader = self.any_table()?;
         reader.check(table)?;
@@ -346,12 +346,12 @@ impl<'a> TableValue<'a> {
         Ok(TableReader { document: self.document, spot, table })
     }
 
-    /// One of several strings; says as well which of them was probably meant.
+    /// One of several strings. The error suggests the nearest one.
     pub(super) fn choice<T: Clone>(&self, choices: &[(&str, T)]) -> Result<T> {
         self.choice_or(choices, |text| did_you_mean(text, choices.iter().map(|(name, _)| *name)))
     }
 
-    /// Same as [`Self::choice`]; `meant` ends the message about a word that is unknown.
+    /// As [`Self::choice`]; `meant` ends the message about an unknown word.
     pub(super) fn choice_or<T: Clone>(
         &self,
         choices: &[(&str, T)],
@@ -368,7 +368,7 @@ impl<'a> TableValue<'a> {
     }
 }
 
-/// Whether a text is an integer as TOML has it.
+/// Whether a text is a TOML integer.
 fn is_number(text: &str) -> bool {
     match text.strip_prefix("0x") {
         Some(hex) => i64::from_str_radix(hex, 16).is_ok(),
@@ -376,7 +376,7 @@ fn is_number(text: &str) -> bool {
     }
 }
 
-/// Whether the key takes the word.
+/// Whether the word is valid for the key.
 fn is_word(table: &keys::KeyTable, key: &str, word: &str) -> bool {
     let words = table.common.iter().filter(|known| known.name == key).map(|known| known.shape);
     words.into_iter().any(|shape| matches!(shape, keys::Shape::Words(words) if words().contains(&word)))

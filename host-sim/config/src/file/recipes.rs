@@ -1,6 +1,6 @@
 //! `[[recipe]]` of both kinds of files: read once, and checked by the layouts themselves.
 //!
-//! In: tables. Out: [`FileRecipe`], which keeps the places for later checks.
+//! In: tables. Out: [`FileRecipe`]s, which have places for later checks.
 
 use proto_core::config::OnStale;
 use proto_core::recipe::CanLayout;
@@ -62,7 +62,7 @@ pub(super) fn read_name(table: &TableReader<'_>) -> Result<(String, Spot)> {
     Ok((name.to_owned(), item.spot))
 }
 
-/// The keys of a recipe depend on its kind.
+/// Checks the keys of a recipe, which depend on its kind.
 fn check_keys(table: &TableReader<'_>, flavour: Flavour) -> Result<()> {
     let given = table.optional("kind").and_then(|item| item.as_string());
     let kind = KINDS.iter().find(|(name, _)| Some(*name) == given).map(|(_, kind)| *kind);
@@ -71,7 +71,7 @@ fn check_keys(table: &TableReader<'_>, flavour: Flavour) -> Result<()> {
         refuse(table, &["exchange"], why)?;
     }
     match kind {
-        // Refused with its kind.
+        // Refused later, with its kind.
         Some(kind) if kind.is_modbus() && flavour == Flavour::Controller => Ok(()),
         Some(kind) if kind.is_modbus() => {
             refuse(
@@ -154,7 +154,7 @@ fn read(table: &TableReader<'_>, flavour: Flavour) -> Result<FileRecipe> {
             part.check_device(table, recipe.carrier(direction), direction)?;
             continue;
         }
-        // UDP needs the least of a stream recipe; it does not take user-defined recipes (D16).
+        // UDP has the fewest requirements of a stream recipe; it does not allow user-defined recipes (D16).
         let framing = if mode == Mode::User { Framing::Bytes } else { Framing::Datagram };
         part.check(Rules { mode, direction }, is_can, framing)
             .map_err(|error| part.spot_of(error).error(table.document, error))?;
@@ -255,7 +255,7 @@ impl FileRecipe {
     /// Checks that a port with this framing can carry the recipe.
     pub(super) fn check_framing(&self, framing: Framing) -> std::result::Result<(), String> {
         if self.is_device() {
-            // Its frames are laid out when the recipe is read, the same for every line.
+            // The frames are laid out when the recipe is read, the same for every line.
             return Ok(());
         }
         for direction in [Direction::Input, Direction::Output] {
@@ -272,7 +272,7 @@ impl FileRecipe {
         if self.is_device() { AnyRecipe::Device(self.to_device()) } else { AnyRecipe::Plain(self.to_sim()) }
     }
 
-    /// The recipe with the names of its fields, without bindings; frames of devices are not in it.
+    /// The recipe with the names of its fields, without bindings and device frames.
     pub(super) fn to_sim(&self) -> SimRecipe {
         let fields = |frame: &FileFrame| {
             let named = |field: &FileField| {

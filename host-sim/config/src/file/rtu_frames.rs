@@ -1,7 +1,7 @@
 //! Whole frames of Modbus RTU around registers and coils, for tools that show frames.
 //!
-//! In: an operation and the fields of its data. Out: its request, its reply and its refusal, with
-//! address, function, counts and CRC.
+//! In: an operation and the fields of its data. Out: its request, reply and refusal, with address, function, counts and
+//! CRC.
 
 use proto_core::config::{FieldSpec, InputBinding};
 use proto_core::device::{Algorithm, ByteOrder, Checksum, Encoding};
@@ -10,7 +10,7 @@ use proto_core::wire::scalar::ScalarType;
 
 use crate::device::{DeviceField, NamedFrame};
 
-/// The frames of one exchange: request, reply and refusal. Nobody answers a broadcast.
+/// The frames of one exchange: request, reply and refusal. A broadcast has no reply.
 pub(super) fn frames(
     slave: u8,
     operation: &Operation,
@@ -67,7 +67,7 @@ impl FrameBuilder {
         self
     }
 
-    /// What stands behind the function in a request.
+    /// The part of a request after the function.
     fn request(self, operation: &Operation, written: &[DeviceField]) -> Self {
         match *operation {
             Operation::WriteCoil { address } => {
@@ -104,9 +104,9 @@ impl FrameBuilder {
         self
     }
 
-    /// Fields behind their number of bytes.
+    /// The number of bytes, and the fields.
     fn data(mut self, len: usize, fields: &[DeviceField]) -> Self {
-        // At most 250 by the limits of the counts.
+        // The limits of the counts allow at most 250.
         self.byte("bytes", len as u8);
         self.fields(fields)
     }

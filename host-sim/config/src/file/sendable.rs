@@ -1,6 +1,6 @@
-//! What an output field of a device's frame may send: `min`, `max` and `outside`, or `map`.
+//! Restrictions of an output field of a device's frame: `min`, `max` and `outside`, or `map`.
 //!
-//! In: the field's table and its encoding. Out: what stands behind the field in the configuration.
+//! In: the field's table and its encoding. Out: the rules that follow the field in the configuration.
 
 use proto_core::config::{FieldSpec, Limits, MapEntry, OutputBinding, check_sent};
 use proto_core::device::{Encoding, Overflow};
@@ -13,7 +13,7 @@ use crate::keys::field::{OUTSIDE, OUTSIDES};
 
 const KEYS: [&str; 4] = ["min", "max", "outside", "map"];
 
-/// What stands behind an output field, with the places of their keys.
+/// The rules that follow an output field, with the places of their keys.
 pub(super) fn read(
     table: &TableReader<'_>,
     encoding: Encoding,
@@ -44,12 +44,12 @@ pub(super) fn read(
     Ok(limits.into_iter().collect())
 }
 
-/// What says something of the field before it.
+/// A rule for the previous field.
 pub(super) fn behind(spot: Spot, spec: FieldSpec) -> FileField {
     FileField::new(spot, String::new(), spec)
 }
 
-/// The limits of a field, whose numbers `number` reads.
+/// The limits of a field; `number` reads their values.
 pub(super) fn read_limits(
     table: &TableReader<'_>,
     encoding: &Encoding,
@@ -83,7 +83,7 @@ fn read_map(map: &TableValue<'_>, encoding: &Encoding) -> Result<Vec<FileField>>
     Ok(entries.into_iter().map(|(spot, entry)| behind(spot, FieldSpec::Mapped(entry))).collect())
 }
 
-/// Adds the entry of a map for the values that its key names, which no earlier entry has; `keys` says what keys are.
+/// Adds the map entry of a key, which no earlier entry may overlap; `keys` describes the keys.
 pub(super) fn add_entry(
     entries: &mut Vec<(Spot, MapEntry)>,
     (key, key_spot, item): (&str, Spot, &TableValue<'_>),

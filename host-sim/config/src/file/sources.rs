@@ -10,10 +10,10 @@ use super::names::{did_you_mean, meant_variable};
 use super::reader::{Result, Spot, TableValue};
 use crate::keys::gateway::HEALTH_TABLE;
 
-/// The values of port 2000, which the gateway asks only when a device picks the command.
+/// Values of port 2000 that the gateway requests only when a device picks the command.
 const ASKED: [&str; 3] = ["last_error", "state", "isprogfinish"];
 
-/// A source, and the name and the place of the port that it is of, which may stand behind the recipe.
+/// A source, and if it is of a port, the port's name and place; the port may come after the recipe in the file.
 pub(super) type FileSource = (OutputBinding, Option<(String, Spot)>);
 
 /// Whether the text names such a source.
@@ -46,7 +46,7 @@ pub(super) fn read(item: &TableValue<'_>, text: &str, scale: f32, offset: f32) -
     Ok((binding, name.map(|name| (name.to_owned(), item.spot.clone()))))
 }
 
-/// `link.modbus.up`, or of a listening port `link.NAME.up`.
+/// `link.modbus.up`, or `link.NAME.up` of a listening port.
 fn read_link(
     item: &TableValue<'_>,
     text: &str,
@@ -73,7 +73,7 @@ fn read_value(item: &TableValue<'_>, name: &str) -> Result<PortValue> {
     })
 }
 
-/// The binding to the port of this name.
+/// The binding to the port with this name.
 pub(super) fn of_port(
     binding: OutputBinding,
     name: &str,
@@ -103,7 +103,7 @@ pub(super) fn of_port(
     }
 }
 
-/// Reads the variables that tell a port's health.
+/// Reads the variables that show a port's health.
 pub(super) fn read_health(item: &TableValue<'_>) -> Result<PortHealth> {
     let table = item.table(&HEALTH_TABLE)?;
     let mut health = PortHealth::NONE;

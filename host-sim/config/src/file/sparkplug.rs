@@ -1,7 +1,7 @@
-//! A Sparkplug file: where and how a gateway tells what it knows.
+//! A Sparkplug file: where and how a gateway publishes.
 //!
-//! In: a TOML file with `[broker]`, `[node]`, `[report]` and `[[rule]]`. Out: plain data. Passwords are in files of
-//! their own; what a name may have, its user knows.
+//! In: a TOML file with `[broker]`, `[node]`, `[report]` and `[[rule]]`. Out: plain data. Does not know which
+//! characters a name may have. Passwords are in files of their own.
 
 use std::path::{Path, PathBuf};
 
@@ -19,18 +19,18 @@ use crate::keys::sparkplug::{
     VALUES,
 };
 
-/// Where and how a gateway tells what it knows.
+/// Where and how a gateway publishes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SparkplugFile {
     /// The broker's name or address.
     pub host: String,
     /// Its port.
     pub port: u16,
-    /// The file of authorities, relative to the file's folder; `None` without TLS.
+    /// The file of certificate authorities, relative to this file's folder; `None` without TLS.
     pub ca: Option<PathBuf>,
     /// The file with user and password.
     pub login: Option<PathBuf>,
-    /// The name for the broker; `None`: made of the group and the node.
+    /// The client id for the broker; `None`: made of the group and the node.
     pub client_id: Option<String>,
     /// The keep-alive.
     pub keep_alive: Duration,
@@ -38,36 +38,36 @@ pub struct SparkplugFile {
     pub group: String,
     /// The edge node.
     pub node: String,
-    /// The primary host that is waited for.
+    /// The primary host to wait for.
     pub primary_host: Option<String>,
-    /// The file that keeps the session's number.
+    /// The file that stores the session number.
     pub bd_seq: Option<PathBuf>,
-    /// How often the gateway is looked at.
+    /// Sampling interval of the gateway.
     pub sample: Duration,
-    /// Least time between two values.
+    /// Minimum time between two values.
     pub interval: Duration,
-    /// Least time between two values of a counter.
+    /// Minimum time between two values of a counter.
     pub counter_interval: Duration,
     /// Further variables of the controller.
     pub values: Vec<VarRange>,
     /// Exceptions.
     pub rules: Vec<ReportRule>,
-    /// Of a board: the server that it asks for UTC, and its port.
+    /// Boards only: the server for UTC, and its port.
     pub time_server: Option<(String, u16)>,
 }
 
-/// How some variables are told.
+/// How some variables are published.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReportRule {
     /// The variables.
     pub values: VarRange,
-    /// A number is told when it is further than this from the last one told.
+    /// A number is published if it differs from the last published one by more than this.
     pub dead_band: f64,
-    /// Least time between two.
+    /// Minimum time between two values.
     pub interval: Option<Duration>,
 }
 
-/// Reads a Sparkplug file. `check` says what is wrong with the name of a group, a node or a host.
+/// Reads a Sparkplug file. `check` returns what is wrong with the name of a group, a node or a host.
 ///
 /// # Errors
 /// The first mistake, with its place.
@@ -83,7 +83,7 @@ pub fn load_sparkplug(
     Ok(file)
 }
 
-/// Same, from a text; files are as the text has them.
+/// As [`load_sparkplug`], from a text; paths of files stay as they are.
 ///
 /// # Errors
 /// The first mistake, with its place.

@@ -57,7 +57,7 @@ impl Assembly<'_> {
         }
     }
 
-    /// The place of what there is no room for.
+    /// The place in the file of what exceeds a capacity.
     fn refused_recipe(&self, from: &FileRecipe, error: ConfigError) -> FileError {
         match error.kind {
             ConfigErrorKind::TooMany { what: Counted::Fields, .. } => {
@@ -132,7 +132,7 @@ fn can_frames<'s>(part: &Option<FilePart>, fields: &'s Frames) -> Vec<CanFields<
 }
 
 impl FileExchange {
-    /// What goes to the device, and what comes from it.
+    /// The frames to the device and from it.
     fn parts(&self) -> [&Option<FilePart>; 4] {
         [&self.output, &self.input, &self.pending, &self.refusal]
     }

@@ -1,4 +1,4 @@
-//! Where in the file is what the configuration calls a place.
+//! Maps places of the configuration to places in the file.
 
 use proto_core::config::{ControllerKey, NetworkKey, Place, RecipeKey};
 use proto_core::sysvar::Direction;
@@ -72,8 +72,8 @@ impl FileRecipe {
         }
     }
 
-    /// The frames of a part as [`Place::Frame`] counts them: those of exchanges behind those of the part, and pending
-    /// answers and refusals only where they have values.
+    /// The frames of a part in the order of [`Place::Frame`]: those of exchanges come after those of the part, pending
+    /// replies and refusals only if they have values.
     fn frames(&self, part: Direction) -> impl Iterator<Item = (&Spot, &[FileField])> {
         let of_exchanges = self.exchanges.iter().flat_map(move |exchange| match part {
             Direction::Output => [exchange.output.as_ref(), None, None],
