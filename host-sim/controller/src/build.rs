@@ -1,4 +1,4 @@
-//! From a configuration to the state at the start.
+//! Builds the initial state from a configuration.
 
 use proto_core::wire::dialect::Dialect;
 use proto_core::wire::state::OperationMode;
@@ -95,14 +95,14 @@ pub(super) fn start_values(config: &SimConfig) -> Result<(Registers, Arm), Build
             _ => {}
         }
     }
-    // An input that is on at the start has no edge.
+    // An input that is on at the start has no rising edge.
     registers.take_risen();
     let mut arm = Arm::at(joints);
     arm.calibrate(pose, &registers.tool());
     Ok((registers, arm))
 }
 
-/// Checks the functions, which a file's reader has checked already.
+/// Checks the functions, which the file's reader has already checked.
 pub(super) fn check_functions(config: &SimConfig) -> Result<(), BuildError> {
     let Functions { inputs, outputs, start } = &config.functions;
     let wrong = |item: &dyn std::fmt::Display, reason: &str| {

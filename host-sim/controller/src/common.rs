@@ -1,4 +1,4 @@
-//! What operations, conditions, events and faults share. Knows none of them.
+//! Shared by operations, conditions, events and faults. Does not know any of these.
 
 use proto_core::wire::state::OperationMode;
 use serde::{Deserialize, Serialize};
@@ -37,7 +37,7 @@ pub enum Number {
 }
 
 impl Number {
-    /// As a number.
+    /// The value as a number.
     pub fn value(self) -> f64 {
         match self {
             Self::Bit(on) => f64::from(u8::from(on)),
@@ -50,7 +50,7 @@ impl Number {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
-    /// From the pendant.
+    /// Operated from the pendant.
     Manual,
     /// Programs started on the pendant.
     Auto,
@@ -114,7 +114,7 @@ pub(super) fn snake(name: &str) -> String {
     text
 }
 
-/// A whole number without a fraction, as registers and bits are.
+/// A number as JSON, without a fraction if it is whole, as registers and bits are.
 pub(super) fn number(value: f64) -> Value {
     let is_whole = value.fract() == 0.0 && value.abs() < 9e15;
     if is_whole { json!(value as i64) } else { json!(value) }

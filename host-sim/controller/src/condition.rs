@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use super::Controller;
 use super::common::{KINDS, Mode, Number, Refused, snake};
 
-/// A condition to wait for: all keys given must hold.
+/// A condition to wait for. All given keys must hold.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Condition {
@@ -26,7 +26,7 @@ pub struct Condition {
     /// The mode.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mode: Option<Mode>,
-    /// The program that runs or is paused; `Some(None)`: none does.
+    /// The running or paused program; `Some(None)`: there is none.
     #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "given")]
     pub program: Option<Option<String>>,
     /// The values of items.
@@ -43,16 +43,16 @@ pub struct Condition {
     pub event: Option<Map<String, Value>>,
 }
 
-/// Tells a null from an absent value.
+/// Distinguishes null from an absent value.
 fn given<'de, D: Deserializer<'de>>(from: D) -> Result<Option<Option<String>>, D::Error> {
     Option::<String>::deserialize(from).map(Some)
 }
 
 impl Condition {
-    /// Whether it can ever hold, but for the names of items, which [`Controller::holds`] knows.
+    /// Whether the condition can ever hold. Does not check the names of items, which [`Controller::holds`] knows.
     ///
     /// # Errors
-    /// Checks the names in it.
+    /// An unknown name or kind.
     pub fn check(&self) -> Result<(), Refused> {
         let known = |key: &str, name: &Option<String>, names: &[&str]| match name {
             Some(name) if !names.contains(&name.as_str()) => {
@@ -136,7 +136,7 @@ impl Controller {
     }
 }
 
-/// Numbers are equal whether they have a fraction or not.
+/// Whether two values are equal, with or without a fraction.
 fn same(own: &Value, wanted: &Value) -> bool {
     match (own.as_f64(), wanted.as_f64()) {
         (Some(own), Some(wanted)) => own == wanted,

@@ -1,5 +1,5 @@
-//! A fault for tests: floats with another value, such as NaN, in state packets and in frames of recipes'
-//! output parts. The item itself keeps its value.
+//! A fault for tests: sends other values of floats, such as NaN, in state packets and in frames of recipes' output
+//! parts. The item itself keeps its value.
 
 use proto_core::sysvar::{IMAGE_BYTES, SysVar};
 use proto_core::wire::scalar::ScalarType;
@@ -7,7 +7,7 @@ use proto_core::wire::state::{FIELDS, LEN};
 
 use recipe_config::{AnalogInput, InitialTarget};
 
-/// The items, and the values that are sent instead.
+/// The items, and the values sent instead.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Corrupted(Vec<Instead>);
 
@@ -50,7 +50,7 @@ impl Corrupted {
         Ok(())
     }
 
-    /// Sends its value again.
+    /// Sends the item's own value again.
     pub(super) fn heal(&mut self, name: &str) -> Result<(), NoSuchFloat> {
         let item = find(name)?;
         self.0.retain(|other| other.item != item);

@@ -1,7 +1,7 @@
 //! The events of the simulated controller (docs/control.md section 5): what happened, when, and by whom.
 //!
-//! In: what the rest of the controller reports. Out: numbered events with the controller's time. Only kept
-//! once [`Controller::record_events`] was called; costs nothing before.
+//! In: reports of the rest of the controller. Out: numbered events with the controller's time. Events are kept only
+//! after [`Controller::record_events`]; before, recording costs nothing.
 
 use std::collections::VecDeque;
 
@@ -32,7 +32,7 @@ pub struct ControllerEvent {
     pub what: Happened,
 }
 
-/// What happened.
+/// The content of an event.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 #[non_exhaustive]
@@ -74,35 +74,35 @@ pub enum Happened {
     Robot {
         /// The state now.
         state: String,
-        /// Before.
+        /// The previous state.
         was: String,
     },
     /// The program state changed.
     ProgramState {
         /// The state now.
         state: String,
-        /// Before.
+        /// The previous state.
         was: String,
     },
     /// The safety state changed.
     Safety {
         /// The state now.
         state: String,
-        /// Before.
+        /// The previous state.
         was: String,
     },
     /// The operation mode changed.
     Mode {
         /// The mode now.
         mode: String,
-        /// Before.
+        /// The previous mode.
         was: String,
     },
     /// The program speed changed.
     Speed {
-        /// Now, per cent.
+        /// The new speed, per cent.
         percent: f32,
-        /// Before.
+        /// The previous speed, per cent.
         was: f32,
     },
     /// A program was started.
@@ -111,7 +111,7 @@ pub enum Happened {
         run: u64,
         /// The program's name.
         program: String,
-        /// By whom: `command`, `pendant` or `function`.
+        /// What has started it: `command`, `pendant` or `function`.
         by: &'static str,
     },
     /// A program has ended.
@@ -125,22 +125,22 @@ pub enum Happened {
     },
     /// An error is shown by `getlasterror`, and, unless it concerns only one command, in the state stream.
     Error {
-        /// Its number.
+        /// The error's number.
         code: u32,
-        /// Its text.
+        /// The error's text.
         text: String,
     },
     /// The error was acknowledged.
     ErrorCleared,
     /// A register, an input or an output has another value.
     Write {
-        /// Its name.
+        /// The item's name.
         item: String,
-        /// Now.
+        /// The new value.
         value: f64,
-        /// Before.
+        /// The previous value.
         was: f64,
-        /// `modbus`, `program`, `control` or a port's name.
+        /// The writer: `modbus`, `program`, `control` or a port's name.
         by: String,
     },
     /// An operation was executed.
@@ -154,7 +154,7 @@ pub enum Happened {
         /// The operation, as it was given.
         #[serde(flatten)]
         operation: Value,
-        /// Why.
+        /// The reason.
         error: String,
     },
 }
@@ -185,7 +185,7 @@ impl Happened {
     }
 }
 
-/// What happened, in words.
+/// The event in words.
 impl std::fmt::Display for Happened {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
@@ -216,11 +216,11 @@ impl std::fmt::Display for Happened {
 #[derive(Debug, Default)]
 pub(super) struct Recorder {
     on: bool,
-    /// Maximum number of kept events, of writes and of all others each.
+    /// Maximum number of kept writes, and of kept other events.
     max: usize,
     next: u64,
     kept: VecDeque<ControllerEvent>,
-    /// Writes are kept apart, so that a fast recipe does not displace everything else.
+    /// Writes are stored separately, so a fast recipe does not displace other events.
     writes: VecDeque<ControllerEvent>,
     /// Number of the newest event that was dropped.
     dropped: u64,
@@ -280,7 +280,7 @@ impl Controller {
         self.record_newest_events(MAX_EVENTS);
     }
 
-    /// The same, with another number of events that are kept: writes, and all others.
+    /// As [`Self::record_events`], with another maximum number of kept events, for writes and for all others.
     pub fn record_newest_events(&mut self, max: usize) {
         self.quiet.ends();
         (self.recorder.on, self.recorder.max) = (true, max.max(1));
@@ -322,7 +322,7 @@ impl Controller {
         }
     }
 
-    /// How the running program ends, if it is ended now.
+    /// Records how the running program has ended.
     pub(super) fn run_over(&mut self, now: Instant, program: &str, end: Option<&End>) {
         let time_s = self.time_s(now);
         let run = self.runs.end(program, end, time_s);
@@ -352,7 +352,7 @@ impl Controller {
         });
     }
 
-    /// Tells of the state machines' changes and errors since the last call.
+    /// Records changes of the state machines and errors since the last call.
     pub(super) fn note_states(&mut self, now: Instant) {
         let errors = self.machine.take_errors();
         if !self.recorder.on {
@@ -397,7 +397,7 @@ impl Controller {
         }
     }
 
-    /// Tells what has changed since `before`.
+    /// Records the changes since `before`.
     pub(super) fn note_writes(&mut self, now: Instant, before: Option<Before>, by: &str) {
         let Some(before) = before else { return };
         let image = *self.registers.image();
@@ -422,7 +422,7 @@ impl Controller {
     }
 }
 
-/// The name, the value before and the value now of what has changed in a variable.
+/// Name, previous value and new value of each change in a variable.
 fn changes(var: SysVar, before: &[u8; IMAGE_BYTES], now: &[u8; IMAGE_BYTES]) -> Vec<(String, f64, f64)> {
     let place = var.image_offset()..var.image_offset() + var.size();
     let (Some(was), Some(is)) = (before.get(place.clone()), now.get(place)) else { return Vec::new() };
@@ -441,7 +441,7 @@ fn changes(var: SysVar, before: &[u8; IMAGE_BYTES], now: &[u8; IMAGE_BYTES]) -> 
     vec![(var.to_string(), value(was), value(is))]
 }
 
-/// A bit's name as people know it; `None` for the status of an output, which follows its command.
+/// The common name of a bit; `None` for the status of an output, which follows its command.
 fn bit_name(var: SysVar, bit: u8) -> Option<String> {
     let nth = bit + 1;
     Some(match (var.group(), var.index()) {
@@ -456,5 +456,5 @@ fn bit_name(var: SysVar, bit: u8) -> Option<String> {
     })
 }
 
-/// Number of events that [`Controller::record_events`] keeps, of writes and of all others each.
+/// Number of writes, and of other events, that [`Controller::record_events`] keeps.
 pub const MAX_EVENTS: usize = 20_000;

@@ -1,6 +1,6 @@
 //! Faults for tests, and operations at the teach pendant (docs/simulated-controller.md section 6).
 //!
-//! They are methods of [`Controller`]; no client can cause them.
+//! All are methods of [`Controller`]; clients cannot cause them.
 
 use proto_core::modbus::Exception;
 use proto_core::time::{Duration, Instant};
@@ -28,16 +28,16 @@ pub(super) struct Faults {
     exception: Option<Exception>,
     state_cut: Option<usize>,
     garbage: [bool; 3],
-    /// The packet that is sent again and again; `Some(None)` until the first one.
+    /// The packet that is repeated; `Some(None)` until the first packet.
     frozen: Option<Option<Box<[u8; LEN]>>>,
     random: Random,
-    /// Additional time of transitions that commands begin.
+    /// Additional time of transitions begun by commands.
     transitions: Duration,
     corrupted: Corrupted,
 }
 
 impl Faults {
-    /// Only the faults of the configuration.
+    /// The faults of the configuration only.
     pub(super) fn new(command_clients: CommandClients) -> Self {
         Self { command_clients, ..Self::default() }
     }
@@ -78,7 +78,7 @@ impl Faults {
         self.garbage[link as usize] = on;
     }
 
-    /// Replaces what is sent by random bytes, if the fault demands it.
+    /// Replaces sent data by random bytes, if the fault is set.
     pub(super) fn corrupt_bytes(&mut self, link: Link, bytes: &mut [u8]) {
         if self.is_garbage(link) {
             self.random.fill(bytes);
@@ -181,7 +181,7 @@ impl Controller {
         self.machine.delay_transitions(by);
     }
 
-    /// Answers every Modbus request with this exception, without carrying it out; `None` ends it.
+    /// Answers every Modbus request with this exception without executing it; `None` ends this.
     pub fn answer_modbus_with(&mut self, exception: Option<Exception>) {
         self.quiet.ends();
         self.faults.exception = exception;
@@ -256,7 +256,7 @@ impl Controller {
         }
         for nth in 0..self.ports.len() {
             let epoch = self.port_epoch(nth, now);
-            // A serial line or bus still exists, and so does the address of the UDP server.
+            // A serial line or bus still exists, as does the address of the UDP server.
             if let Some(port) = self.ports.get_mut(nth).filter(|port| port.is_up()) {
                 port.went_down();
                 port.came_up(now, epoch);
@@ -276,8 +276,8 @@ impl Controller {
 
 /// Loss of the registers.
 impl Controller {
-    /// As [`Self::restart`], but registers and outputs are 0 whatever their initial values are. Only wired
-    /// inputs and the arm have their initial values.
+    /// As [`Self::restart`], but registers and outputs are 0 instead of their initial values. Only wired inputs and the
+    /// arm have their initial values.
     pub fn restart_cleared(&mut self, now: Instant) {
         self.quiet.ends();
         self.restart(now);
@@ -313,7 +313,7 @@ impl Controller {
     pub fn force(&mut self, target: InitialTarget, value: f64) -> Result<(), SetError> {
         self.quiet.ends();
         self.registers.force(target, value)?;
-        // The tool's frame decides where the TCP is.
+        // The tool's frame determines the TCP's position.
         self.arm_shown = None;
         Ok(())
     }

@@ -1,8 +1,8 @@
 //! Functions of functional inputs, and states on functional outputs (D27, docs/simulated-controller.md
 //! section 7).
 //!
-//! An input's rising edge does what its command on port 2000 would do, without an answer. Several edges at
-//! one instant are executed in the order of [`Function::ALL`].
+//! An input's rising edge has the effect of the command on port 2000, without a reply. Several edges at one instant are
+//! executed in the order of [`Function::ALL`].
 
 use proto_core::command::Action;
 use proto_core::time::Instant;
@@ -49,7 +49,7 @@ impl Controller {
         self.act(now, action).map(drop)
     }
 
-    /// Adds the input to the error of the function that was refused.
+    /// Adds the input's name to the error of the refused function.
     fn name_input(&mut self, item: InitialTarget) {
         if let Some(error) = self.machine.error() {
             let (id, message) = (error.id, format!("{item}: {}", error.message));

@@ -1,4 +1,4 @@
-//! What goes into a [`Controller`](crate::Controller) and what comes out of it.
+//! Inputs and outputs of a [`Controller`](crate::Controller).
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -102,7 +102,7 @@ pub enum ControllerInput<'a> {
         /// The frame.
         frame: CanFrame,
     },
-    /// Everything given to the port has left.
+    /// Everything sent on the port has left.
     PortSent {
         /// The port.
         port: usize,
@@ -145,8 +145,8 @@ pub enum ControllerOutput {
         /// The bytes.
         bytes: Vec<u8>,
     },
-    /// Send a frame on a CAN port. Up to 32 follow each other; report [`ControllerInput::PortSent`] once,
-    /// when all of them were sent.
+    /// Send a frame on a CAN port. Up to 32 follow each other; report [`ControllerInput::PortSent`] once, when all of
+    /// them were sent.
     PortSendCan {
         /// The port.
         port: usize,

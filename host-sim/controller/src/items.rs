@@ -1,5 +1,5 @@
-//! Items that a program or a test names: system variables, inputs and outputs, states, and values of the state
-//! packet (docs/simulated-controller.md section 4).
+//! Items named by a program or a test: system variables, inputs and outputs, states, and values of the state packet
+//! (docs/simulated-controller.md section 4).
 
 use proto_core::config::{StateValue, StateValueError};
 use proto_core::wire::dialect::Dialect;
@@ -10,7 +10,7 @@ use super::Controller;
 use super::program::CallReply;
 use super::registers::PacketItem;
 
-/// An item of this name cannot be read, or cannot have this value.
+/// An item with this name cannot be read, or cannot have this value.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ItemError {
     /// The name.
@@ -52,9 +52,9 @@ impl Controller {
         }
     }
 
-    /// Sets an item. A system variable, an input or an output is set as by [`Self::force`], for everyone. An
-    /// item of the state packet, reserved ones as well, has this value in packets, and in `get` of a program,
-    /// until [`Self::release_item`] or a restart; other interfaces show what the model has.
+    /// Sets an item. A system variable, an input or an output is set as by [`Self::force`], for all interfaces. An item
+    /// of the state packet, even a reserved one, has this value in packets and in `get` of a program until
+    /// [`Self::release_item`] or a restart; other interfaces show the model's value.
     ///
     /// # Errors
     /// [`ItemError`] if there is no such item, or it cannot have the value; nothing changed.
@@ -95,7 +95,7 @@ impl Controller {
 }
 
 impl Controller {
-    /// The value of an item. A bit and a state are bits, everything else is a number.
+    /// The value of an item. A bit and a state are returned as bits, everything else as a number.
     ///
     /// # Errors
     /// The name, and what is wrong with it.

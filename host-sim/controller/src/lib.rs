@@ -96,7 +96,7 @@ pub struct Controller {
     state_grid: Grid,
     /// The origin of all grids: the first instant of a call.
     epoch: Option<Instant>,
-    /// The ports' phases against the origin of the grids.
+    /// Offset of each port's grid from the origin.
     phases: Vec<Duration>,
     state_phase: Duration,
     faults: Faults,
@@ -162,8 +162,8 @@ impl Controller {
         })
     }
 
-    /// Lets a seed choose the phases of the state stream and of the ports' cycles, and what random faults
-    /// send. To be called before anything else.
+    /// Lets a seed choose the phases of the state stream and of the ports' cycles, and the data of random faults. Call
+    /// it before anything else.
     pub fn seed(&mut self, seed: u64) {
         self.quiet.ends();
         let mut random = Random::seeded(seed);
@@ -188,7 +188,7 @@ impl Controller {
         if let ControllerInput::ModbusBytes { conn, bytes } = input
             && self.quiet.lasts(now)
         {
-            // Time has brought nothing, and requests that only read change nothing that it could bring.
+            // Nothing is due, and requests that only read change nothing.
             let (before, effect) = self.modbus_bytes(now, conn, bytes);
             if effect == Requested::Changes {
                 self.quiet.ends();
@@ -198,7 +198,7 @@ impl Controller {
         self.quiet.ends();
         self.advance(now);
         let mut before = match input {
-            // Most requests only read: it is copied by the first that does not.
+            // Most requests only read; the first write makes the copy.
             ControllerInput::ModbusBytes { .. } => None,
             _ => self.writer_of(&input).and_then(|_| self.recorder.before(&self.registers)),
         };
@@ -255,7 +255,7 @@ impl Controller {
         // `poll_output` does the rest.
     }
 
-    /// Who writes registers by this input, if it can.
+    /// The writer of registers for this input, if it can write any.
     fn writer_of(&self, input: &ControllerInput<'_>) -> Option<&str> {
         match *input {
             ControllerInput::ModbusBytes { .. } => Some("modbus"),

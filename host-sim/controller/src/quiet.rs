@@ -1,18 +1,19 @@
 //! When [`Controller::advance`] can be skipped: nothing changes until the next input or deadline.
 //!
-//! Most calls are Modbus requests that only read from an idle controller, where it would find nothing to do.
+//! Most calls are Modbus requests that only read from an idle controller, where [`Controller::advance`] has nothing to
+//! do.
 
 use proto_core::time::Instant;
 
 use super::Controller;
 
-/// Until when [`Controller::advance`] finds nothing. Every other change of the controller must call [`Self::ends`].
+/// The end of the time in which [`Controller::advance`] has nothing to do. Other changes must call [`Self::ends`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Quiet {
     until: Instant,
     /// The value of [`Controller::deadline`] until then.
     deadline: Instant,
-    /// False in a test that compares the controller with one that always looks.
+    /// False in a test that compares the controller with one that always advances.
     #[cfg(test)]
     allowed: bool,
 }
@@ -29,17 +30,17 @@ impl Default for Quiet {
 }
 
 impl Quiet {
-    /// Whether time has brought nothing at `now`.
+    /// Whether nothing is due at `now`.
     pub(super) fn lasts(&self, now: Instant) -> bool {
         now < self.until
     }
 
-    /// The controller's deadline, if it is known without a look.
+    /// The controller's deadline, if it is known without computing it.
     pub(super) fn deadline(&self, now: Instant) -> Option<Instant> {
         self.lasts(now).then_some(self.deadline)
     }
 
-    /// Something changes the controller.
+    /// Something has changed the controller.
     pub(super) fn ends(&mut self) {
         self.until = Instant::ZERO;
     }
@@ -57,13 +58,13 @@ impl Quiet {
 }
 
 impl Controller {
-    /// Notes that nothing is left to do, and until when. Returns the deadline.
+    /// Records that nothing is left to do, and until when. Returns the deadline.
     pub(super) fn rest(&mut self) -> Instant {
         let deadline = self.deadline();
-        // What a program waits for is not only an instant.
+        // A program may wait for more than an instant.
         let until = match self.running {
             Some(_) => Instant::ZERO,
-            // Without clients the state stream has no deadline, but its grid goes on.
+            // Without clients, the state stream has no deadline but its grid continues.
             None => deadline.min(self.state_grid.next()).min(self.next_arm_state()),
         };
         self.quiet.begins(until, deadline);

@@ -1,4 +1,4 @@
-//! Random numbers that a seed decides: xorshift64*.
+//! Pseudorandom numbers from a seed: xorshift64*.
 
 #[derive(Debug, Clone)]
 pub(super) struct Random(u64);
@@ -11,7 +11,7 @@ impl Default for Random {
 
 impl Random {
     pub(super) fn seeded(seed: u64) -> Self {
-        // Never 0, from which it would not move.
+        // Never 0: the generator would stay there.
         Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ 0x2545_F491_4F6C_DD1D | 1)
     }
 
@@ -22,7 +22,7 @@ impl Random {
         self.0.wrapping_mul(0x2545_F491_4F6C_DD1D)
     }
 
-    /// A number below `end`; 0 if that is 0.
+    /// A number below `end`; 0 if `end` is 0.
     pub(super) fn below(&mut self, end: u64) -> u64 {
         self.next().checked_rem(end).unwrap_or(0)
     }

@@ -1,4 +1,4 @@
-//! What happens with time: transitions, the program's calls, cycles and the state stream.
+//! Effects of time: transitions, the program's calls, cycles and the state stream.
 
 use proto_core::command::Action;
 use proto_core::time::{Duration, Instant};
@@ -23,12 +23,12 @@ pub(super) struct RunningProgram {
 /// The state of the program's pending call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Activity {
-    /// The call takes no time, or was not handled yet.
+    /// The call takes no time or has not been handled yet.
     None,
     Waiting {
         until: Instant,
     },
-    /// A wait that was interrupted by a pause.
+    /// A wait interrupted by a pause.
     Held {
         left: Duration,
     },
@@ -36,7 +36,7 @@ enum Activity {
     Sending {
         port: usize,
     },
-    /// Until the next slice.
+    /// Waiting for the next slice.
     GivingWay {
         until: Instant,
     },
@@ -85,7 +85,7 @@ impl Controller {
         all.into_iter().flatten().min().unwrap_or(Instant::NEVER)
     }
 
-    /// A command, button or input for the machine, with what it does to the rest of the controller.
+    /// Executes a command, button or input on the machine and applies its effect on the rest of the controller.
     ///
     /// # Errors
     /// The error that the machine shows; nothing else has changed.
@@ -210,7 +210,7 @@ impl Controller {
         }
     }
 
-    /// When the registers show another state of the arm than now: in the next cycle of the drives, or at rest.
+    /// When the registers show another state of the arm: in the next cycle of the drives, or at rest.
     pub(super) fn next_arm_state(&self) -> Instant {
         let Some(shown) = self.arm_shown else { return Instant::ZERO };
         match self.arm.rest() {
@@ -219,7 +219,7 @@ impl Controller {
         }
     }
 
-    /// Answers the program's calls as far as possible now.
+    /// Answers the program's calls as far as possible.
     fn drive_program(&mut self, now: Instant) {
         while self.machine.program_runs() {
             let Some(running) = &self.running else { return };
@@ -260,7 +260,7 @@ impl Controller {
         }
     }
 
-    /// The answer to a call; `None` if it has none yet.
+    /// The reply to a call; `None` if it is not done yet.
     fn serve(&mut self, now: Instant, call: &Call) -> Option<CallReply> {
         let activity = self.running.as_ref().map_or(Activity::None, |running| running.activity);
         match call {
@@ -347,7 +347,7 @@ impl Controller {
         }
     }
 
-    /// Waits for this time since the call was first handled.
+    /// Waits for this time from when the call was first handled.
     fn wait(&mut self, now: Instant, activity: Activity, time: Duration) -> Option<CallReply> {
         let until = match activity {
             Activity::Waiting { until } => until,
@@ -370,7 +370,7 @@ impl Controller {
         started.map_err(|error| format!("{function}: {error}"))
     }
 
-    /// Notes what the call waits for, and returns no answer.
+    /// Records what the call waits for; returns no reply.
     fn begin_activity(&mut self, activity: Activity) -> Option<CallReply> {
         if let Some(running) = &mut self.running {
             running.activity = activity;
@@ -428,7 +428,7 @@ impl Controller {
     }
 }
 
-/// The reason that `last_run` shows for a program that an action ends.
+/// The reason shown in `last_run` for a program that an action ends.
 fn cause_of(action: Action) -> &'static str {
     match action {
         Action::Disable => "disable",
@@ -438,7 +438,7 @@ fn cause_of(action: Action) -> &'static str {
     }
 }
 
-/// Maximum length of a program's name in the error that it ended with, in bytes.
+/// Maximum length of a program's name in its error, in bytes.
 const MAX_NAME: usize = 64;
 /// Interval at which the arm's state is updated.
 const SERVO_CYCLE: Duration = Duration::from_millis(1);

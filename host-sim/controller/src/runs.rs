@@ -1,20 +1,20 @@
-//! How programs ended (docs/control.md section 3).
+//! Results of programs (docs/control.md section 3).
 
 use serde::Serialize;
 
 use super::Controller;
 use super::program::End;
 
-/// A run of a program that has ended.
+/// An ended run of a program.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Run {
-    /// 1, 2, 3, ...
+    /// Number of the run, from 1.
     pub run: u64,
     /// The program's name.
     pub program: String,
     /// How it ended.
     pub outcome: RunOutcome,
-    /// Why it failed, or what has stopped it.
+    /// Why it failed, or what stopped it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
     /// The line in the script where it failed, from 1.
@@ -25,7 +25,7 @@ pub struct Run {
     pub column: Option<usize>,
     /// When it was started, in seconds since the controller's start.
     pub started_s: f64,
-    /// When it had ended and the arm was at rest.
+    /// When the program had ended and the arm was at rest.
     pub ended_s: f64,
 }
 
@@ -33,11 +33,11 @@ pub struct Run {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RunOutcome {
-    /// It reached its end.
+    /// The program reached its end.
     Finished,
-    /// An error that it did not catch.
+    /// The program did not catch an error.
     Failed,
-    /// A command, a person or a safety stop has ended it.
+    /// A command, a person or a safety stop has ended the program.
     Stopped,
 }
 
@@ -65,7 +65,7 @@ impl std::fmt::Display for Run {
 pub(super) struct Runs {
     pub started: u64,
     started_s: f64,
-    /// What ends the running program, if something does.
+    /// Why the running program is being ended, if it is.
     cause: Option<&'static str>,
     last: Option<Run>,
 }
@@ -112,18 +112,18 @@ impl Runs {
 }
 
 impl Controller {
-    /// The newest program that has ended since the controller was switched on.
+    /// The last ended run since the controller was switched on.
     pub fn last_run(&self) -> Option<&Run> {
         self.runs.last.as_ref()
     }
 
-    /// Number of programs that were started so far.
+    /// Number of programs started so far.
     pub fn runs(&self) -> u64 {
         self.runs.started
     }
 }
 
-/// The text and the position of the interpreter's message, which ends with `(line 7, position 5)`.
+/// The text and the position of an interpreter's message, which ends with `(line 7, position 5)`.
 fn position_of(message: &str) -> (String, Option<(usize, usize)>) {
     let place = || {
         let (text, place) = message.strip_suffix(')')?.rsplit_once("(line ")?;

@@ -113,7 +113,7 @@ impl TestController {
         Ok(robot)
     }
 
-    /// The same from the text of a configuration file (docs/configuration.md section 5).
+    /// As [`Self::new`], from the text of a configuration file (docs/configuration.md section 5).
     ///
     /// # Errors
     /// The first mistake in the text, with its line, or a [`BuildError`].

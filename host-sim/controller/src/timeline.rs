@@ -1,7 +1,7 @@
 //! Timelines: operations at given times and when conditions begin to hold (docs/control.md section 6).
 //!
-//! In: a file's text, then the time and the controller after each change. Out: the operations that are due,
-//! and the next deadline. Does not carry them out, and does not know clocks.
+//! In: a file's text, then the time and the controller after each change. Out: the operations that are due, and the
+//! next deadline. Does not execute them and does not know clocks.
 
 mod file;
 
@@ -18,7 +18,7 @@ use super::operations::Operation;
 #[derive(Debug, Clone)]
 pub struct Timeline {
     steps: Vec<TimelineStep>,
-    /// The first instant of a call.
+    /// The time of the first call.
     began: Option<Instant>,
 }
 
@@ -26,9 +26,9 @@ pub struct Timeline {
 struct TimelineStep {
     trigger: StepTrigger,
     operation: Operation,
-    /// When it is to be done, earliest first.
+    /// When the step is due, earliest first.
     due: VecDeque<Instant>,
-    /// When it was last done.
+    /// When the step was last executed.
     done: Option<Instant>,
 }
 
@@ -44,12 +44,12 @@ enum StepTrigger {
         /// Number of the first event that counts.
         since: u64,
     },
-    /// It was due, and will not be again.
+    /// The step was due and will not be again.
     Over,
 }
 
 impl Timeline {
-    /// Notes which conditions have begun to hold.
+    /// Records which conditions have begun to hold.
     pub fn observe(&mut self, now: Instant, controller: &Controller) {
         let began = *self.began.get_or_insert(now);
         for step in &mut self.steps {
@@ -63,12 +63,12 @@ impl Timeline {
                     let holds = controller.holds(condition, *since) == Ok(true);
                     if !std::mem::replace(held, holds) && holds {
                         if step.due.len() < MAX_DUE {
-                            // A step whose operation brings about its own condition lets time pass.
+                            // Lets time pass after a step whose operation fulfils its own condition.
                             let again = step.done.map_or(now, |done| done + MIN_INTERVAL);
                             step.due.push_back((now + *after).max(again));
                         }
                         if condition.event.is_some() {
-                            // The next such event makes it hold again.
+                            // The next such event fulfils it again.
                             (*since, *held) = (controller.newest_event() + 1, false);
                         }
                         if !*repeat {
@@ -90,7 +90,7 @@ impl Timeline {
         Some((number, step.operation.clone()))
     }
 
-    /// When a step is due; [`Instant::NEVER`] if none waits for a time.
+    /// When the next step is due; [`Instant::NEVER`] if none waits for a time.
     pub fn deadline(&self) -> Instant {
         let due = self.steps.iter().filter_map(|step| step.due.front());
         due.min().copied().unwrap_or(Instant::NEVER)
@@ -107,9 +107,9 @@ impl Timeline {
     }
 }
 
-/// A repeated step that waits for `after_s` so often already misses further times.
+/// Maximum number of pending times of a repeated step with `after_s`; further times are missed.
 const MAX_DUE: usize = 1_000;
-/// The least time between two times of the same step.
+/// Minimum time between two executions of a step.
 const MIN_INTERVAL: Duration = Duration::from_millis(1);
 
 #[cfg(test)]

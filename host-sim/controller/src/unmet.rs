@@ -1,4 +1,4 @@
-//! Why a condition does not hold, in words, for waits that time out.
+//! Explains in words why a condition does not hold, for waits that time out.
 
 use proto_core::modbus::server::RegisterBank;
 use serde_json::{Value, json};
@@ -69,7 +69,7 @@ impl Controller {
     }
 }
 
-/// A name without quotes; null, as a program that is wanted, in a word.
+/// The value as text: a name without quotes, `none` for null.
 fn plain(value: &Value) -> String {
     match value {
         Value::String(name) => name.clone(),

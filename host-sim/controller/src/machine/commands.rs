@@ -1,4 +1,4 @@
-//! Commands of clients: what is allowed in which state, and the transition that each begins (D25).
+//! Commands of clients: which states allow a command, and the transition that it begins (D25).
 
 use proto_core::command::{Action, Percent};
 use proto_core::time::{Duration, Instant};
@@ -40,7 +40,7 @@ impl Machine {
         self.check_start(Starter::Client)
     }
 
-    /// The same at the pendant, where a program can be started in manual mode too.
+    /// As [`Self::check_run`] for the pendant, which can also start a program in manual mode.
     ///
     /// # Errors
     /// The error that was recorded.
@@ -63,7 +63,7 @@ impl Machine {
         Err(self.refuse(ErrorId::WrongState, &format!("run: {why}")))
     }
 
-    /// A command that is answered with success or fail: begins its transition.
+    /// Executes a command that is answered with success or fail: begins its transition.
     ///
     /// # Errors
     /// The error that was recorded; nothing else changed.
@@ -77,8 +77,8 @@ impl Machine {
         Ok((effect, Transition { action, begun: self.begun }))
     }
 
-    /// Whether the robot is where the command would lead it, so that nothing is left to do. Only of power
-    /// and drives: without a program, `stop` and `pause` are refused.
+    /// Whether the robot is already in the state that the command leads to. Only for power and drives: without a
+    /// program, `stop` and `pause` are refused.
     pub fn is_already(&self, action: Action) -> bool {
         match action {
             Action::PowerOn => matches!(
@@ -106,7 +106,7 @@ impl Machine {
                 _ => Err("the robot is not powered off"),
             },
             Action::PowerOff => match self.robot {
-                // Allowed during every transition, which must not keep the power on.
+                // Allowed during every transition, because no transition may keep the power on.
                 Robot::PoweringOn { .. }
                 | Robot::Disabled
                 | Robot::Enabling { .. }
@@ -171,8 +171,7 @@ impl Machine {
         }
     }
 
-    /// Records that an accepted command is answered with fail. If a safety stop was the cause, its error
-    /// stays.
+    /// Records that an accepted command is answered with fail. The error of a safety stop that caused this is kept.
     pub fn not_completed(&mut self, action: Action, why: &str) {
         if !self.safety_has_acted() {
             self.fail(ErrorId::NotCompleted, format!("{}: {why}", action.word()));

@@ -24,7 +24,7 @@ pub enum ErrorId {
     Collision,
     /// The safety controller has failed.
     SafetyFailure,
-    /// An operation at run time has raised it; the number is the operation's.
+    /// Raised by an operation at run time, which also chooses the number.
     Raised(u32),
 }
 
@@ -45,7 +45,7 @@ impl ErrorId {
         }
     }
 
-    /// Whether it only concerns one command, not the robot or a program.
+    /// Whether the error concerns only one command, not the robot or a program.
     pub const fn is_refusal(self) -> bool {
         matches!(self, Self::NoSuchProgram | Self::WrongState | Self::BadArgument | Self::NotCompleted)
     }

@@ -1,12 +1,12 @@
 //! The controller's states: power and enable, program, safety, mode
 //! (docs/simulated-controller.md section 1; the codes are in proto-core/docs/wire/state.md section 4).
 //!
-//! In: commands, faults, the time, and when the arm comes to rest. Out: whether a command is allowed, the
-//! effect on arm and program, and the states that clients see. Does not know command texts or connections,
-//! and neither runs programs nor moves the arm.
+//! In: commands, faults, the time, and when the arm comes to rest. Out: whether a command is allowed, its effect on arm
+//! and program, and the states shown to clients. Does not know command texts or connections, does not run programs or
+//! move the arm.
 //!
-//! An accepted command begins a [`Transition`]. [`Machine::progress`] returns its state, so that the command
-//! can be answered at its end (D25).
+//! An accepted command begins a [`Transition`]. [`Machine::progress`] returns its state, and the command is answered at
+//! its end (D25).
 
 mod commands;
 mod errors;
@@ -31,32 +31,32 @@ pub struct Machine {
     safety: Safety,
     /// A person is in a zone of reduced speed.
     is_reduced: bool,
-    /// Why the safety controller does not work.
+    /// Why the safety controller is not working.
     hold: Option<SafetyHold>,
     mode: OperationMode,
     speed_percent: f32,
     collision_axis: Option<u8>,
     error: Option<ErrorEntry>,
     robot_error: Option<ErrorId>,
-    /// Errors and acknowledgements (`None`) since [`Machine::take_errors`].
+    /// Errors, and `None` for acknowledgements, since [`Machine::take_errors`].
     new_errors: Vec<Option<ErrorEntry>>,
-    /// Transitions so far, of power and drives, and of the program.
+    /// Number of transitions of power and drives, and of the program.
     begun: Begun,
-    /// Additional time of every transition that a command begins.
+    /// Additional time of every transition begun by a command.
     delay: Duration,
 }
 
-/// The effect on the rest of the controller.
+/// What the rest of the controller has to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effect {
-    /// None.
+    /// Nothing.
     None,
-    /// Slow the arm down to rest on its path, and hold the program. Report the time of rest with
+    /// Decelerate the arm to rest on its path, and hold the program. Report the time of rest with
     /// [`Machine::arm_rests_at`].
     Hold,
-    /// Continue from there.
+    /// Continue after [`Effect::Hold`].
     Continue,
-    /// End the program and slow the arm down to rest, whose time is reported as for [`Effect::Hold`].
+    /// End the program and decelerate the arm to rest; report the time as for [`Effect::Hold`].
     Abort(Braking),
     /// The program has ended and the arm is at rest.
     ProgramEnded,
@@ -64,7 +64,7 @@ pub enum Effect {
     ShutDown,
 }
 
-/// The state of power and drives. A state that ends by itself has its deadline.
+/// The state of power and drives. A transient state has a deadline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Robot {
     Booting { shown: RobotState, until: Instant },
@@ -98,10 +98,10 @@ enum Safety {
 pub use recipe_config::Power;
 
 impl Machine {
-    /// A controller that has booted, or with [`Power::Boot`] one that waits for [`Self::booting`].
+    /// A booted controller, or with [`Power::Boot`] one that waits for [`Self::booting`].
     pub fn new(power: Power, mode: OperationMode) -> Self {
         let robot = match power {
-            // The first call sets the time, by `booting`.
+            // `booting` sets the time in the first call.
             Power::Boot => Robot::Booting { shown: BOOT[0].0, until: Instant::NEVER },
             Power::Off => Robot::Off,
             Power::On => Robot::Disabled,
@@ -179,7 +179,7 @@ impl Machine {
         self.speed_percent
     }
 
-    /// The axis of the collision that stopped the robot; `None` once it is cleared.
+    /// The axis of the collision that has stopped the robot; `None` once the collision is cleared.
     pub fn collision_axis(&self) -> Option<u8> {
         self.collision_axis
     }
@@ -189,7 +189,7 @@ impl Machine {
         self.robot_error
     }
 
-    /// The newest error of any kind, if there is one.
+    /// The newest error of any kind.
     pub fn error(&self) -> Option<&ErrorEntry> {
         self.error.as_ref()
     }
@@ -199,7 +199,7 @@ impl Machine {
         matches!(self.robot, Robot::Enabled | Robot::Disabling { shown: RobotState::Enable, .. })
     }
 
-    /// The present speed as a fraction of the planned speed.
+    /// The present speed divided by the planned speed.
     pub fn rate(&self) -> f64 {
         let reduced = if self.is_reduced { REDUCED_RATE } else { 1.0 };
         f64::from(self.speed_percent) / 100.0 * reduced
@@ -220,12 +220,12 @@ impl Machine {
         self.program = Program::Stopped;
     }
 
-    /// Makes transitions of commands longer by `by` from now on.
+    /// Makes transitions begun by commands longer by `by` from now on.
     pub fn delay_transitions(&mut self, by: Duration) {
         self.delay = by;
     }
 
-    /// Reports when the arm, which was slowed down, will be at rest.
+    /// Reports when the decelerating arm will be at rest.
     pub fn arm_rests_at(&mut self, rest: Instant) {
         if let Program::Pausing { until } | Program::Stopping { until } = &mut self.program {
             *until = (*until).max(rest);
@@ -304,7 +304,7 @@ impl Machine {
         self.note_error(Some(error));
     }
 
-    /// Raises an error of any number, as the robot itself does.
+    /// Raises an error with any number, as the robot itself does.
     pub fn raise(&mut self, code: u32, message: impl Into<String>) {
         self.fail(ErrorId::Raised(code), message);
     }
@@ -317,8 +317,7 @@ impl Machine {
         }
     }
 
-    /// The errors, and `None` for each acknowledgement, since the last call; the newest
-    /// [`MAX_NEW_ERRORS`].
+    /// Errors, and `None` for each acknowledgement, since the last call; at most the newest [`MAX_NEW_ERRORS`].
     pub(crate) fn take_errors(&mut self) -> Vec<Option<ErrorEntry>> {
         std::mem::take(&mut self.new_errors)
     }
@@ -350,7 +349,7 @@ const DISABLE: Duration = Duration::from_millis(100);
 const SHUT_DOWN: Duration = Duration::from_millis(100);
 /// Maximum number of errors that wait to be reported.
 const MAX_NEW_ERRORS: usize = 64;
-/// Minimum duration of a pause and a stop; an arm in motion makes it longer.
+/// Minimum duration of a pause and a stop; a moving arm makes it longer.
 const PAUSE: Duration = Duration::from_millis(20);
 const STOP: Duration = Duration::from_millis(20);
 const RECOVER: Duration = Duration::from_millis(200);

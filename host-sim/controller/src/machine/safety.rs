@@ -1,4 +1,4 @@
-//! Stops and reduced speed, as safety devices cause them.
+//! Stops and reduced speed, as caused by safety devices.
 
 use proto_core::time::Instant;
 use proto_core::wire::state::SafetyState;
@@ -26,24 +26,24 @@ impl Stop {
     }
 }
 
-/// A state in which the safety controller does not watch the robot, so that the robot must not move.
+/// Why the safety controller does not monitor the robot, which then must not move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SafetyHold {
     /// SS_WAIT.
     Wait,
-    /// SS_CONFIG: its parameters are being changed.
+    /// SS_CONFIG: the safety parameters are being changed.
     Config,
     /// SS_MODEL.
     Model,
-    /// SS_UPDATE: its firmware is being updated. The power cannot be switched on.
+    /// SS_UPDATE: the safety firmware is being updated. The power cannot be switched on.
     Update,
-    /// SS_FAIL: it has failed. The power cannot be switched on.
+    /// SS_FAIL: the safety controller has failed. The power cannot be switched on.
     Fail,
 }
 
 impl SafetyHold {
-    /// The state that clients see.
+    /// The state shown to clients.
     pub fn state(self) -> SafetyState {
         match self {
             Self::Wait => SafetyState::Wait,
@@ -56,7 +56,8 @@ impl SafetyHold {
 }
 
 impl Machine {
-    /// Reduced speed on or off, as a safety zone requests it. During a stop it is noted, and holds after it.
+    /// Switches reduced speed on or off, as a safety zone does. A stop takes precedence; reduced speed applies after
+    /// it.
     pub fn set_reduced(&mut self, reduced: bool) {
         self.is_reduced = reduced;
     }
@@ -117,7 +118,7 @@ impl Machine {
         self.drop_drives(now)
     }
 
-    /// A stop never replaces a stronger one.
+    /// Shows a stop, unless a stronger stop is shown.
     fn show_stop(&mut self, stop: Stop) {
         self.safety = match self.safety {
             Safety::Stopped(present) => Safety::Stopped(present.max(stop)),
@@ -145,7 +146,7 @@ impl Machine {
         matches!(self.hold, Some(SafetyHold::Update | SafetyHold::Fail))
     }
 
-    /// Whether a cause for what happens to the program and the drives is shown already.
+    /// Whether a shown safety state already explains what happens to the program and the drives.
     pub(super) fn safety_has_acted(&self) -> bool {
         matches!(self.safety, Safety::Stopped(_)) || self.hold == Some(SafetyHold::Fail)
     }

@@ -1,10 +1,10 @@
-//! Transitions: how an accepted command is followed to its end (D25).
+//! Transitions: from an accepted command to its result (D25).
 
 use proto_core::command::Action;
 
 use super::{Machine, Program, Robot};
 
-/// Numbers of transitions. Of each kind only the newest can be in progress.
+/// Number of transitions of each kind. Only the newest of a kind can be in progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Begun {
     pub(super) robot: u64,
@@ -28,17 +28,17 @@ impl Transition {
 /// The state of a [`Transition`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TransitionProgress {
-    /// It is in progress.
+    /// The transition is in progress.
     InProgress,
-    /// It has reached the state that the command asked for.
+    /// The requested state is reached.
     Done,
-    /// Another one began before its end.
+    /// Another transition began before the end of this one.
     Superseded,
 }
 
 impl Machine {
-    /// The state of a transition. To be called after every change: once another transition has begun, this
-    /// one counts as superseded, even if it was done.
+    /// The state of a transition. Call it after every change: once another transition has begun, this one counts as
+    /// superseded, even if it was done.
     pub fn progress(&self, transition: Transition) -> TransitionProgress {
         let program_rests = self.program == Program::Stopped;
         let done = match transition.action {
@@ -49,7 +49,7 @@ impl Machine {
             Action::Stop => program_rests,
             Action::Pause => self.program == Program::Paused,
             Action::Resume => self.program == Program::Running,
-            // It is answered at once, because its end closes every connection.
+            // Answered at once, because its end closes every connection.
             Action::Shutdown => true,
         };
         let is_newest = match transition.action {

@@ -1,4 +1,4 @@
-//! The progress of a move: its path time, which runs at a rate that changes in ramps.
+//! The progress of a move: path time, whose rate changes in ramps.
 
 use proto_core::time::{Duration, Instant};
 
@@ -27,7 +27,7 @@ pub(super) struct PathTime {
 }
 
 impl PathClock {
-    /// At 0, not running.
+    /// A stopped clock at path time 0.
     pub(super) fn stopped() -> Self {
         Self { anchor: Instant::ZERO, position_s: 0.0, rate: 0.0, target: 0.0, slope: NORMAL_SLOPE }
     }
@@ -48,7 +48,7 @@ impl PathClock {
     pub(super) fn at(&self, now: Instant) -> PathTime {
         let dt = now.saturating_since(self.anchor).as_micros() as f64 * 1e-6;
         let (ramp_s, slope) = self.ramp();
-        // Instants are whole microseconds: closer than that, the ramp is over.
+        // Instants are whole microseconds: with less than that left, the ramp is over.
         if dt + 0.5e-6 < ramp_s {
             let position_s = self.position_s + self.rate * dt + 0.5 * slope * dt * dt;
             return PathTime { position_s, rate: self.rate + slope * dt, rate_change: slope };
@@ -67,7 +67,7 @@ impl PathClock {
         let (ramp_s, slope) = self.ramp();
         let after_ramp = self.after_ramp();
         let dt = if after_ramp >= goal_s {
-            // rate·t + slope/2·t² = missing, in the form without cancellation.
+            // rate·t + slope/2·t² = missing, in a form without cancellation.
             let root = (self.rate * self.rate + 2.0 * slope * missing).max(0.0).sqrt();
             2.0 * missing / (self.rate + root)
         } else if self.target > 0.0 {
@@ -78,7 +78,7 @@ impl PathClock {
         Some(self.anchor + micros(dt))
     }
 
-    /// When the clock stops; `None` if it does not.
+    /// When the clock stops; `None` if it does not stop.
     pub(super) fn halts(&self) -> Option<Instant> {
         (self.target <= 0.0).then(|| self.anchor + micros(self.ramp().0))
     }
@@ -95,7 +95,7 @@ impl PathClock {
     }
 }
 
-/// Rounded up, so that the goal is reached at that instant.
+/// Rounded up, so the goal is reached at that instant.
 fn micros(seconds: f64) -> Duration {
     Duration::from_micros((seconds * 1e6).ceil() as u64)
 }

@@ -1,7 +1,7 @@
-//! Forward kinematics: joints to frames, poses and twists. The way back is in `inverse`.
+//! Forward kinematics: joints to frames, poses and twists. Inverse kinematics are in `inverse`.
 //!
-//! Trigonometry is from libm, not from the system, so that poses, and with them the traces of soak runs, are
-//! identical on every machine.
+//! Trigonometry is from libm, not from the system, so poses, and with them the traces of soak runs, are identical on
+//! every machine.
 
 mod inverse;
 
@@ -66,12 +66,12 @@ impl Pose {
         self.rotation.map(|row| row.iter().zip(vector).map(|(a, b)| a * b).sum())
     }
 
-    /// Without rotation, at this place.
+    /// A frame with this origin and no rotation.
     pub(super) fn at(origin: [f64; 3]) -> Self {
         Self { origin, ..Self::IDENTITY }
     }
 
-    /// With another origin and no rotation, both in the parent's axes.
+    /// A frame moved by this vector and without rotation, both in the parent's axes.
     pub(super) fn shifted(&self, way: [f64; 3]) -> Self {
         Self::at([0, 1, 2].map(|nth| self.origin[nth] + way[nth]))
     }

@@ -1,7 +1,7 @@
 //! A straight line of the TCP, as a path of the joints.
 //!
-//! The path is exact at every point: the inverse kinematics on the branch that the arm is on at the start. The
-//! samples only say which turn of a joint is meant, and whether the whole line can be followed.
+//! The path is exact at every point: it uses the inverse kinematics on the branch of the arm at the start. The samples
+//! only select the turn of each joint, and show whether the whole line can be followed.
 
 use super::geometry::{Branch, JOINTS, Pose, length};
 use super::{
@@ -15,7 +15,7 @@ pub(super) struct LinearPath {
     from: Pose,
     /// m, in the base frame.
     way: [f64; 3],
-    /// Of the TCP at the start.
+    /// Axis of the rotation in the TCP's frame at the start.
     axis: [f64; 3],
     angle: f64,
     /// From the TCP to the flange.
@@ -23,7 +23,7 @@ pub(super) struct LinearPath {
     branch: Branch,
     /// Joints at equal steps of the move's time.
     samples: Vec<[f64; JOINTS]>,
-    /// Duration at full rate, s; 0 if there is no way to go.
+    /// Duration at full rate, s; 0 if the target is reached at the start.
     pub(super) length_s: f64,
 }
 
@@ -53,7 +53,7 @@ impl LinearPath {
             (PEAK_ACCELERATION * angle / MAX_ACCEL_RAD_S2).sqrt(),
         ];
         let length_s = length_s.into_iter().fold(0.0, f64::max);
-        // The solution that the arm has now.
+        // The solution that matches the arm now.
         let own = Branch::all().find(|&branch| {
             flange.joints(branch).is_some_and(|joints| {
                 near(joints, from).iter().zip(from).all(|(a, b)| (a - b).abs() < SAME_RAD)
@@ -77,7 +77,7 @@ impl LinearPath {
             let joints = line.solve(x).ok_or(MoveError::OutOfReach { way_m: at_m })?;
             let joints = near(joints, &before);
             if joints.iter().zip(&before).any(|(a, b)| (a - b).abs() > MAX_STEP_RAD) {
-                // At the end of its reach the arm is straight, and so are its joints fast.
+                // The joints are fast where the arm is stretched, at the end of its reach.
                 let leads_out = line.solve(1.0).is_none();
                 let way_m = at_m;
                 return Err(if leads_out {
@@ -97,7 +97,7 @@ impl LinearPath {
         Ok(line)
     }
 
-    /// Checks the joints' speeds, and makes the move as long as their accelerations need.
+    /// Checks the joints' speeds, and lengthens the move as their accelerations require.
     fn limit(&mut self) -> Result<(), MoveError> {
         if self.length_s <= 0.0 {
             return Ok(());
@@ -118,7 +118,7 @@ impl LinearPath {
         Ok(())
     }
 
-    /// The joints at this fraction of the move's time, and their first two derivatives by it.
+    /// The joints at this fraction of the move's time, and their first two derivatives.
     pub(super) fn at(&self, x: f64) -> [[f64; JOINTS]; 3] {
         let here = self.joints(x);
         if x <= 0.0 || x >= 1.0 {
@@ -147,7 +147,7 @@ impl LinearPath {
     }
 }
 
-/// The same joints, each in the turn that is nearest to `to`.
+/// The same joint positions, each in the turn that is nearest to `to`.
 fn near(joints: [f64; JOINTS], to: &[f64; JOINTS]) -> [f64; JOINTS] {
     let turn = 2.0 * std::f64::consts::PI;
     std::array::from_fn(|nth| joints[nth] - ((joints[nth] - to[nth]) / turn).round() * turn)
@@ -157,12 +157,12 @@ fn near(joints: [f64; JOINTS], to: &[f64; JOINTS]) -> [f64; JOINTS] {
 pub const MAX_SPEED_M_S: f64 = 2.0;
 /// Maximum acceleration of the TCP, m/s².
 const MAX_ACCEL_M_S2: f64 = 8.0;
-/// How fast the tool turns on the way, rad/s.
+/// Maximum rotational speed of the tool, rad/s.
 const MAX_TURN_RAD_S: f64 = std::f64::consts::FRAC_PI_2;
 const SAMPLES: usize = 256;
-/// A joint that turns farther between two samples jumps.
+/// A joint that turns farther than this between two samples jumps.
 const MAX_STEP_RAD: f64 = 0.3;
-/// The inverse kinematics return the joints themselves within this.
+/// Tolerance within which inverse kinematics return the original joints.
 const SAME_RAD: f64 = 1e-5;
 /// Step of the difference quotients.
 const STEP: f64 = 1e-4;

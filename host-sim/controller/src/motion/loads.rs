@@ -1,12 +1,11 @@
-//! Forces that the arm's own weight and its payload cause: what a sensor at flange or base would show without
-//! contact.
+//! Forces of the arm's own weight and its payload: what a sensor at flange or base would show without contact.
 
 use super::geometry::{JOINTS, Pose};
 
 /// What the flange carries.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Payload {
-    /// kg.
+    /// Mass, kg.
     pub mass_kg: f64,
     /// Centre of mass in the flange's frame, m.
     pub centre_m: [f64; 3],
@@ -17,13 +16,13 @@ pub struct Payload {
 pub struct Loads {
     /// On the flange, in its frame: the payload's weight and inertia.
     pub flange: [f64; 6],
-    /// On the base, in its frame: the same, and the links' weight.
+    /// On the base, in its frame: payload and links.
     pub base: [f64; 6],
 }
 
 impl Loads {
-    /// At these joint positions (rad) and this linear acceleration of the TCP (m/s²), which stands for that of
-    /// the payload. The inertia of the links is left out.
+    /// The loads at these joint positions (rad) and this linear acceleration of the TCP (m/s²), which is taken for that
+    /// of the payload. The inertia of the links is ignored.
     pub fn of(joints: &[f64; JOINTS], acceleration: [f64; 3], payload: &Payload) -> Self {
         let frames = Pose::along(joints);
         let flange = frames[JOINTS];
@@ -47,7 +46,7 @@ impl Loads {
 
 /// m/s².
 const GRAVITY: f64 = 9.81;
-/// Masses of the links, kg, each in the middle between its axes: those of a generic arm of this reach.
+/// Masses of the links of a generic arm of this reach, kg, each at the midpoint between its axes.
 const LINK_KG: [f64; JOINTS] = [4.5, 7.5, 3.8, 1.4, 1.4, 0.4];
 
 #[cfg(test)]

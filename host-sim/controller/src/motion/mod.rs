@@ -1,9 +1,9 @@
 //! The arm: positions of its joints at any instant, and the values derived from them
 //! (docs/simulated-controller.md section 3).
 //!
-//! In: moves, the rate of motion, an instant. Out: positions, speeds, torques and the TCP's pose. Everything
-//! is a closed formula of time: nothing is stepped, and the same instant always gives the same numbers. Does
-//! not know programs, registers or states.
+//! In: moves, the rate of motion, an instant. Out: positions, speeds, torques and the TCP's pose. Does not know
+//! programs, registers or states. Everything is a closed formula of time: nothing is stepped, and the same instant
+//! always gives the same numbers.
 //!
 //! The geometry is that of a generic six-axis cobot with a reach of about 0.9 m, not the calibration of a
 //! product.
@@ -31,12 +31,12 @@ pub struct Arm {
     origin: [f64; JOINTS],
     /// Joint travel of the present move, rad.
     travel: [f64; JOINTS],
-    /// The present move, if it is a line; then there is no travel.
+    /// The present move, if it is a line; `travel` is then zero.
     line: Option<Box<LinearPath>>,
     /// Duration of the present move at full rate, s; 0 if there is none.
     length_s: f64,
     clock: PathClock,
-    /// Added to the computed pose, so that the initial pose can be configured.
+    /// Offset of the pose, which allows an initial pose to be configured.
     pose_offset: [f64; 6],
 }
 
@@ -48,17 +48,17 @@ pub enum MoveError {
     JointRange {
         /// 1-based.
         joint: usize,
-        /// The position asked for, rad.
+        /// The requested position, rad.
         position_rad: f64,
     },
     /// The speed is not within (0, [`MAX_SPEED_RAD_S`]].
     Speed {
-        /// The speed asked for, rad/s.
+        /// The requested speed, rad/s.
         speed_rad_s: f64,
     },
     /// The speed of a line is not within (0, [`MAX_SPEED_M_S`]].
     LineSpeed {
-        /// The speed asked for, m/s.
+        /// The requested speed, m/s.
         speed_m_s: f64,
     },
     /// The pose has a value that is not finite.
@@ -68,8 +68,7 @@ pub enum MoveError {
         /// The point's distance from the start of the line, m.
         way_m: f64,
     },
-    /// A joint would have to jump: the line leads through a singular pose, where the wrist or the elbow is
-    /// straight.
+    /// A joint would have to jump: the line passes through a singular pose, where the wrist or the elbow is straight.
     Singular {
         /// The point's distance from the start of the line, m.
         way_m: f64,
@@ -156,7 +155,7 @@ impl Arm {
         }
     }
 
-    /// Sets the pose offset so that the present pose is `pose`; `None` items stay.
+    /// Sets the pose offset for the present pose to become `pose`; `None` items stay.
     pub fn calibrate(&mut self, pose: [Option<f64>; 6], tool: &Pose) {
         let computed = Pose::of_joints(&self.origin).then(tool).pose();
         for ((offset, wanted), computed) in self.pose_offset.iter_mut().zip(pose).zip(computed) {
@@ -260,7 +259,7 @@ impl Arm {
             *item += offset;
         }
         let twist = Twist::of(&q, &qd, tool);
-        // The twist a little later, for its derivative.
+        // The twist a little later, to compute its derivative.
         let (mut q_next, mut qd_next) = (q, qd);
         for nth in 0..JOINTS {
             q_next[nth] += qd[nth] * STEP_S;

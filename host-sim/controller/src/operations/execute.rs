@@ -12,12 +12,11 @@ use crate::common::number;
 use crate::program::{self, Script};
 
 impl Controller {
-    /// Executes an operation. Call [`Self::poll_output`] until it returns
-    /// [`ControllerOutput::Sleep`](crate::ControllerOutput::Sleep) after it. `now` must not be earlier than in
-    /// the last call.
+    /// Executes an operation. Then call [`Self::poll_output`] until it returns
+    /// [`ControllerOutput::Sleep`](crate::ControllerOutput::Sleep). `now` must not be earlier than in the last call.
     ///
     /// # Errors
-    /// [`Refused`]; nothing changed. `follow`, `advance` and `wait` are always refused: they are the caller's.
+    /// [`Refused`]; nothing changed. `follow`, `advance` and `wait` are always refused: the caller executes them.
     pub fn operate(&mut self, now: Instant, operation: &Operation) -> Done {
         self.quiet.ends();
         self.begin(now);
@@ -155,7 +154,7 @@ impl Controller {
             return refused(self.newest_error());
         }
         if speed.is_some() {
-            // It is within its range.
+            // The value is within the allowed range.
             let _ = self.machine.set_speed(speed);
         }
         match self.start_program(now, &script, None, "pendant") {
@@ -170,7 +169,7 @@ impl Controller {
         Refused(format!("program: there is no program {name}; there are {names}"))
     }
 
-    /// Whether an operation may name this program: to run it as commands do, or to remove it.
+    /// Checks the program's name in an operation that runs it, as commands do, or removes it.
     pub(crate) fn check_program(&self, operation: &Operation) -> Result<(), Refused> {
         let (program, is_there) = match operation {
             Operation::Run { program, .. } => (program, program::named(&self.scripts, program).is_some()),

@@ -1,4 +1,4 @@
-//! Faults as operations: what can be wrong with a server, a port, an item or the transitions.
+//! Faults as operations: of a server, a port, an item or the transitions.
 
 use proto_core::modbus::Exception;
 use proto_core::time::Duration;
@@ -11,13 +11,13 @@ use crate::{Controller, Link};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Fault {
-    /// On a server.
+    /// The affected server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub server: Option<Link>,
-    /// On a recipe port, by its name.
+    /// Name of the affected recipe port.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub port: Option<String>,
-    /// On an item, by its name.
+    /// Name of the affected item.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub item: Option<String>,
     /// Additional time of transitions, in seconds.
@@ -46,21 +46,21 @@ pub struct Fault {
 pub enum FaultKind {
     /// Nothing is sent.
     Mute,
-    /// Answers come later.
+    /// Replies are delayed.
     Delay,
     /// New connections are closed.
     Refuse,
     /// All connections are closed, once.
     Disconnect,
-    /// Random bytes are sent in place of the right ones.
+    /// Random bytes are sent instead of the data.
     Garbage,
     /// Every Modbus request is answered with an exception.
     Exception,
-    /// The same state packet is sent again and again.
+    /// The same state packet is repeated.
     Freeze,
-    /// One state packet ends early.
+    /// One state packet is truncated.
     Cut,
-    /// Another number is sent in place of an item's.
+    /// Another number is sent instead of the item's value.
     #[serde(rename = "spoil")]
     Corrupt,
 }
@@ -81,17 +81,17 @@ impl FaultKind {
     }
 }
 
-/// What is sent in place of an item's value.
+/// What is sent instead of an item's value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, expecting = "a number, \"nan\", \"inf\" or \"-inf\"")]
 pub enum CorruptedValue {
     /// A number.
     Number(f32),
-    /// None.
+    /// NaN or an infinity.
     No(NoNumber),
 }
 
-/// A float that is no number.
+/// A float that is not a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum NoNumber {
     /// NaN.
@@ -204,7 +204,7 @@ impl Controller {
     }
 }
 
-/// Arguments that do not belong to the kind are refused: they would be overlooked.
+/// Refuses arguments that do not belong to the kind, which would have no effect.
 fn check_arguments(fault: &Fault) -> Result<(), Refused> {
     let given = [
         ("seconds", fault.seconds.is_some(), FaultKind::Delay),

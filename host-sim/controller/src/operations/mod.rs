@@ -1,8 +1,8 @@
-//! Operations at run time (docs/control.md section 2): what a person at the pendant, a cable that breaks, or a
-//! test does to the controller.
+//! Operations at run time (docs/control.md section 2): effects on the controller by a person at the pendant, a broken
+//! cable, or a test.
 //!
-//! In: an [`Operation`], as JSON by serde. Out: its result as JSON, or why it was refused; a refused operation
-//! has changed nothing. The way it came in is its caller's.
+//! In: an [`Operation`], as JSON by serde. Out: its result as JSON, or why it was refused; a refused operation has
+//! changed nothing. Does not know where the operation came from.
 
 mod execute;
 mod fault;
@@ -37,28 +37,29 @@ pub enum Operation {
     Programs {},
     /// The kept events.
     Events {
-        /// From this number on.
+        /// Starting with this number.
         #[serde(default)]
         since: u64,
-        /// Only these kinds; all if it is empty.
+        /// Only these kinds; empty: all.
         #[serde(default)]
         kinds: Vec<String>,
-        /// At most so many.
+        /// Maximum number.
         #[serde(default = "default_max")]
         max: usize,
     },
-    /// Each event from now on, to the caller. [`Controller::operate`](crate::Controller::operate) refuses it: the caller follows.
+    /// Reports each event from now on. [`Controller::operate`](crate::Controller::operate) refuses this: the caller
+    /// follows.
     Follow {
-        /// Only these kinds; all if it is empty.
+        /// Only these kinds; empty: all.
         #[serde(default)]
         kinds: Vec<String>,
     },
-    /// Sets items: all of them, or none.
+    /// Sets all of these items, or none.
     Set {
         /// Name and value of each.
         items: BTreeMap<String, Number>,
     },
-    /// Turns the key.
+    /// Turns the key switch.
     Mode {
         /// The mode.
         mode: Mode,
@@ -74,14 +75,14 @@ pub enum Operation {
     },
     /// Releases and acknowledges a stop.
     Clear {},
-    /// The safety controller stops watching the robot, or goes on.
+    /// Makes the safety controller stop or resume monitoring the robot.
     Hold {
-        /// Why it does not watch; `None`: it does again.
+        /// Why it does not monitor; `None`: it does.
         safety: Option<SafetyHold>,
     },
     /// A person enters or leaves a zone of reduced speed.
     Reduced {
-        /// Whether a person is in it.
+        /// Whether a person is in the zone.
         on: bool,
     },
     /// Shows an error.
@@ -94,19 +95,19 @@ pub enum Operation {
     },
     /// Acknowledges the shown error.
     ClearError {},
-    /// The pendant's button.
+    /// Presses the pendant's button.
     PowerOn {},
-    /// The pendant's button.
+    /// Presses the pendant's button.
     PowerOff {},
-    /// The pendant's button.
+    /// Presses the pendant's button.
     Enable {},
-    /// The pendant's button.
+    /// Presses the pendant's button.
     Disable {},
     /// Starts a program.
     Run {
         /// Its name.
         program: String,
-        /// The speed; the present one if it is absent.
+        /// The speed; the present speed if absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         speed_percent: Option<f32>,
     },
@@ -114,7 +115,7 @@ pub enum Operation {
     Stop {},
     /// Pauses the program.
     Pause {},
-    /// Lets the program go on.
+    /// Resumes the program.
     Resume {},
     /// Adds or replaces a program.
     Upload {
@@ -150,7 +151,7 @@ pub enum Operation {
     },
     /// Begins a fault.
     Fault(Fault),
-    /// Ends faults: all that are on this server, port or item, or all.
+    /// Ends all faults, or those on this server, port or item.
     Heal {
         /// The server.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -161,20 +162,21 @@ pub enum Operation {
         /// The item's name.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         item: Option<String>,
-        /// The longer transitions.
+        /// Whether to end the longer transitions.
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         transitions: bool,
     },
-    /// Moves a stepped clock. [`Controller::operate`](crate::Controller::operate) refuses it: the clock is the caller's.
+    /// Moves a stepped clock. [`Controller::operate`](crate::Controller::operate) refuses this: the clock is the
+    /// caller's.
     Advance {
-        /// By so many seconds.
+        /// Number of seconds.
         seconds: f64,
     },
-    /// Waits. [`Controller::operate`](crate::Controller::operate) refuses it: the clock is the caller's.
+    /// Waits. [`Controller::operate`](crate::Controller::operate) refuses this: the clock is the caller's.
     Wait {
-        /// For this.
+        /// The condition to wait for.
         until: Condition,
-        /// For so many seconds at most.
+        /// Timeout in seconds.
         #[serde(default = "default_timeout")]
         timeout_s: f64,
     },
@@ -198,7 +200,7 @@ fn refused<T>(why: impl Into<String>) -> Result<T, Refused> {
 }
 
 impl Operation {
-    /// From a JSON object whose `do` is the operation's name.
+    /// Parses a JSON object whose `do` is the operation's name.
     ///
     /// # Errors
     /// [`Refused`]: what is wrong, and what is allowed.
@@ -209,7 +211,7 @@ impl Operation {
         Self::deserialize(Value::Object(object)).map_err(|error| Refused(error.to_string()))
     }
 
-    /// Whether it only reads or waits.
+    /// Whether the operation only reads or waits.
     pub const fn is_reading(&self) -> bool {
         matches!(
             self,
@@ -225,10 +227,10 @@ impl Operation {
     }
 }
 
-/// Whether all kinds exist.
+/// Checks that all kinds exist.
 ///
 /// # Errors
-/// The first that does not, with those that do.
+/// The first unknown kind, and the known ones.
 pub fn check_kinds(kinds: &[String]) -> Result<(), Refused> {
     match kinds.iter().find(|kind| !KINDS.contains(&kind.as_str())) {
         Some(wrong) => refused(format!("kinds: there are no events {wrong}; there are {}", KINDS.join(", "))),
@@ -236,10 +238,10 @@ pub fn check_kinds(kinds: &[String]) -> Result<(), Refused> {
     }
 }
 
-/// A time in seconds, of the key `name`.
+/// The time in seconds of the key `name`.
 ///
 /// # Errors
-/// It is not within 0 to a day.
+/// The time is not within 0 to a day.
 pub fn time(name: &str, seconds: f64) -> Result<Duration, Refused> {
     if !(0.0..=MAX_SECONDS).contains(&seconds) {
         return refused(format!("{name}: {seconds} is not within 0 to {MAX_SECONDS}"));
@@ -247,7 +249,7 @@ pub fn time(name: &str, seconds: f64) -> Result<Duration, Refused> {
     Ok(Duration::from_micros((seconds * 1e6).round() as u64))
 }
 
-/// The longest time that is waited, delayed or planned for.
+/// Maximum time of a wait, a delay or a step.
 const MAX_SECONDS: f64 = 86_400.0;
 
 const fn default_max() -> usize {

@@ -8,20 +8,20 @@ use proto_core::time::{Duration, Instant};
 /// The addresses that the UDP server streams to.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Clients {
-    /// Each with the time of its newest datagram.
+    /// Addresses with the time of the newest datagram.
     known: Vec<(SocketAddr, Instant)>,
 }
 
 /// Maximum number of UDP clients.
 pub const MAX_UDP_CLIENTS: usize = 8;
-/// A client that should send and has been silent for this long is removed (D30). Otherwise a forged address
-/// would get the stream for ever.
+/// A client that should send is removed after this silence (D30). Otherwise a forged address would get the stream for
+/// ever.
 const SILENCE: Duration = Duration::from_secs(60);
 
 impl Clients {
-    /// A datagram came from `peer`. Returns whether another client was displaced: the one silent for longest,
-    /// of the address with most clients, including the new one. So a host that sends from many ports
-    /// displaces itself.
+    /// Handles a datagram from `peer`. Returns whether another client was displaced: the one silent for longest, of the
+    /// address with the most clients, including the new one. A host that sends from many ports thus displaces its own
+    /// clients.
     pub(super) fn add(&mut self, now: Instant, peer: SocketAddr) -> bool {
         if let Some(client) = self.known.iter_mut().find(|client| client.0 == peer) {
             client.1 = now;
@@ -44,7 +44,7 @@ impl Clients {
         full
     }
 
-    /// Removes clients that have been silent for too long, and returns their number.
+    /// Removes clients that have been silent for too long and returns their number.
     pub(super) fn forget_silent(&mut self, now: Instant) -> usize {
         let before = self.known.len();
         self.known.retain(|&(_, heard)| now.saturating_since(heard) < SILENCE);

@@ -3,9 +3,9 @@
 //! In: received bytes, datagrams and CAN frames, the time, and frames of a program. Out: values of input
 //! variables, output frames on a fixed grid, and frames for a program. Does not know devices or sockets.
 //!
-//! A realtime output part is sent on an absolute grid that all ports share. A cycle that is due while the
-//! frame before is still being sent, or while the line is not quiet, is skipped and counted, never sent
-//! later. Every received frame is applied at once.
+//! A realtime output part is sent on an absolute grid that all ports share. A cycle that is due while the previous
+//! frame is still being sent, or while the line is not quiet, is skipped and counted, never sent late. Every received
+//! frame is applied at once.
 
 mod clients;
 mod receive;
@@ -58,11 +58,11 @@ enum Medium {
 #[derive(Debug, PartialEq)]
 enum Transmitter {
     Idle,
-    /// The cycle's frame waits for a quiet line; it is encoded when it is sent.
+    /// The cycle's frame waits for a quiet line and is encoded when it is sent.
     CycleDue,
     /// A program's frame waits for a quiet line.
     Waiting(PortData),
-    /// Until everything was sent.
+    /// Everything was handed to the device and has not been sent yet.
     Sending,
 }
 
@@ -95,8 +95,8 @@ impl RecipePort {
         })
     }
 
-    /// Gives the port the recipe that `port` has now. Partial frames, frames that wait for a program, and UDP
-    /// clients are dropped with the old recipe (D24).
+    /// Takes the present recipe of `port`. Partial frames, frames that wait for a program, and UDP clients are dropped
+    /// with the old recipe (D24).
     pub(super) fn assign(
         &mut self,
         now: Instant,

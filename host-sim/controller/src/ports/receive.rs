@@ -1,4 +1,4 @@
-//! The receiving side of a port: from bytes, datagrams and CAN frames to registers, or to a program.
+//! The receiving side of a port: bytes, datagrams and CAN frames to registers or to a program.
 
 use std::collections::VecDeque;
 use std::net::SocketAddr;
@@ -81,7 +81,7 @@ impl RecipePort {
         }
     }
 
-    /// Removes silent clients, if the recipe has an input part that they should send (D30).
+    /// Removes silent clients, if they should send because the recipe has an input part (D30).
     pub(crate) fn forget_silent(&mut self, now: Instant) {
         if let Medium::UdpServer(clients) = &mut self.medium
             && self.recipe.as_ref().is_some_and(|(_, parts)| parts.has_input())
@@ -196,7 +196,7 @@ impl Sink<'_> {
     }
 }
 
-/// Maximum number of frames that wait for a program; then the oldest is dropped.
+/// Maximum number of frames that wait for a program; a further frame displaces the oldest.
 pub const MAX_INBOX: usize = 64;
 /// Silence on TCP after which a partial frame is discarded (D19).
 const IDLE_GAP: Duration = Duration::from_millis(50);

@@ -17,7 +17,7 @@ pub(super) enum PartLayouts {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum RecipeError {
-    /// There is no such recipe.
+    /// The recipe does not exist.
     NoSuchRecipe,
     /// A CAN recipe on a port that is no CAN bus, or a stream recipe on a CAN bus (D16).
     WrongKind,
@@ -113,7 +113,7 @@ fn fields(fields: &[SimField]) -> impl Iterator<Item = proto_core::recipe::model
     fields.iter().map(|field| field.field)
 }
 
-/// The frame that a program names by an id, whether that is standard or extended.
+/// The frame with this id, standard or extended, as a program names it.
 pub(super) fn frame_of(layout: &CanLayout, id: i64) -> Option<usize> {
     layout.ids().position(|own| match own {
         CanId::Standard(own) => i64::from(own) == id,

@@ -29,15 +29,15 @@ pub(crate) enum Handed {
 }
 
 impl RecipePort {
-    /// Whether a program's frame was not yet sent.
+    /// Whether the last frame of a program has not been sent yet.
     pub(crate) fn is_busy(&self) -> bool {
         self.transmitter != Transmitter::Idle
     }
 
-    /// Queues a program's frame. It was sent when [`Self::is_busy`] is false again.
+    /// Queues a program's frame, which was sent once [`Self::is_busy`] is false again.
     ///
     /// # Errors
-    /// What is wrong with the recipe, the id or the values, whether the port is connected or not.
+    /// What is wrong with the recipe, the id or the values, even if the port is not connected.
     pub(crate) fn send(&mut self, id: Option<i64>, values: &[f64]) -> Result<Handed, String> {
         let name = &self.name;
         let Some((Mode::User, parts)) = &self.recipe else {
@@ -97,7 +97,7 @@ impl RecipePort {
             Transmitter::CycleDue => {
                 self.forget_silent(now);
                 let frames = self.cycle_frames(image);
-                // Datagrams are sent at once; for everything else the end is reported.
+                // Datagrams are sent at once; otherwise the driver reports the end.
                 if !frames.is_empty() && !matches!(self.medium, Medium::UdpServer(_) | Medium::UdpClient) {
                     self.transmitter = Transmitter::Sending;
                 }
@@ -149,7 +149,7 @@ impl RecipePort {
         }
     }
 
-    /// When the line may be driven: on half duplex, after the turnaround.
+    /// When sending is allowed: on a half-duplex line, after the turnaround.
     fn quiet_at(&self) -> Instant {
         match self.medium {
             Medium::Rs485 { turnaround, .. } if self.counters.bytes_in > 0 => self.newest_byte + turnaround,

@@ -81,7 +81,7 @@ fn register_flow(engine: &mut Engine, link: &Arc<ScriptLink>) {
         l.run_other(context.engine(), name)
     });
     engine.register_fn("raise", |reason: Dynamic| -> ScriptResult<()> { Err(reason.to_string().into()) });
-    // The interpreter's own functions would block the model, or read the machine's clock.
+    // The interpreter's own functions would block the model or read the machine's clock.
     engine.register_fn("sleep", |_: INT| -> ScriptResult<()> { Err("sleep: use wait_ms".into()) });
     engine.register_fn("sleep", |_: FLOAT| -> ScriptResult<()> { Err("sleep: use wait_ms".into()) });
     engine
@@ -93,7 +93,7 @@ fn register_log(engine: &mut Engine, link: &Arc<ScriptLink>) {
     engine.register_fn("log", move |value: Dynamic| -> ScriptResult<()> {
         l.call(Call::Log(one_line(&value.to_string()))).map(|_| ())
     });
-    // The interpreter has a logarithm of this name, which would be the better match.
+    // Overrides the interpreter's logarithm, which would be the better match for a float.
     let l = Arc::clone(link);
     engine.register_fn("log", move |value: FLOAT| -> ScriptResult<()> {
         l.call(Call::Log(Dynamic::from(value).to_string())).map(|_| ())
@@ -109,7 +109,7 @@ fn register_log(engine: &mut Engine, link: &Arc<ScriptLink>) {
     });
 }
 
-/// What `comm_recv` returns: the list of the values, on CAN with the id first; an empty one if none came.
+/// The result of `comm_recv`: the list of values, on CAN after the id; empty if no frame came.
 fn frame(answer: CallReply) -> Array {
     let CallReply::Frame { id, values } = answer else { return Array::new() };
     let id = id.map(|id| match id {
@@ -119,7 +119,7 @@ fn frame(answer: CallReply) -> Array {
     id.into_iter().chain(values.into_iter().map(dynamic)).collect()
 }
 
-/// What `comm_send` returns (D28).
+/// The result of `comm_send` (D28).
 fn was_sent(answer: CallReply) -> bool {
     answer != CallReply::Bit(false)
 }

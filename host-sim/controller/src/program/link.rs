@@ -1,4 +1,4 @@
-//! The thread of a script, and its end of the lock-step with the model.
+//! The thread of a script, which runs in lock-step with the model.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, SyncSender};
@@ -14,19 +14,18 @@ use super::{
     script,
 };
 
-/// An answer with the model's time.
 #[derive(Debug)]
 pub(super) struct Stamped {
     pub(super) now: Instant,
     pub(super) answer: CallReply,
 }
 
-/// The thread's end of both channels.
+/// The thread's ends of both channels.
 pub(super) struct ScriptLink {
     events: SyncSender<Progress>,
     answers: Mutex<Receiver<Stamped>>,
     variables: Arc<Mutex<Variables>>,
-    /// What a script can call by name.
+    /// Scripts that can be called by name.
     scripts: Vec<Script>,
     /// The scripts that were called and have not returned, outermost first.
     called: Mutex<Vec<String>>,
@@ -34,18 +33,18 @@ pub(super) struct ScriptLink {
     slice_began: AtomicU64,
     /// Operations used in this slice.
     spent: AtomicU64,
-    /// Operations that one operation counts for: more if the variables are large, because they may be copied.
+    /// Number of operations that each operation counts for: more with large variables, which it may copy.
     charge: AtomicU64,
     /// Operations until the size of the variables is checked again.
     weigh_in: AtomicU64,
-    /// A call has returned since the variables were published.
+    /// A call has returned since variables were last published.
     stale: AtomicBool,
-    /// The program must end, or the model is gone. After a function that cannot fail, such as `print`, the
-    /// next operation ends the script.
+    /// The program must end, or the model is gone. After a function that cannot fail, such as `print`, the next
+    /// operation ends the script.
     over: AtomicBool,
 }
 
-/// Functions that call the model, by the names that they have in a compiled script.
+/// Functions that call the model, by their names in a compiled script.
 const CALLS: [&str; 9] =
     ["comm_recv", "comm_send", "get", "set", "movej", "movel", "wait_ms", script::CALL_PROGRAM, "log"];
 
@@ -86,7 +85,7 @@ impl ScriptLink {
         let _ = self.events.send(Progress::Ended(end));
     }
 
-    /// Hands control to the model until it answers.
+    /// Hands control to the model until the model replies.
     pub(super) fn call(&self, call: Call) -> ScriptResult<CallReply> {
         self.spend(CALL_OPERATIONS)?;
         let answer = self.exchange(call)?;
@@ -94,7 +93,7 @@ impl ScriptLink {
         Ok(answer)
     }
 
-    /// Runs another script to its end, with variables of its own.
+    /// Runs another script, with its own variables, to its end.
     pub(super) fn run_other(&self, engine: &Engine, name: &str) -> ScriptResult<()> {
         self.spend(CALL_OPERATIONS)?;
         let Some(script) = script::named(&self.scripts, name) else {
@@ -128,7 +127,7 @@ impl ScriptLink {
         }
     }
 
-    /// Counts operations. At the end of the slice the script waits for the next one.
+    /// Counts operations. When the slice is used up, waits for the next slice.
     fn spend(&self, operations: u64) -> ScriptResult<()> {
         if self.spent.fetch_add(operations, Relaxed) + operations <= SLICE_OPERATIONS {
             return Ok(());
@@ -159,14 +158,14 @@ impl ScriptLink {
         }
     }
 
-    /// The model's answer; `None` if it is gone.
+    /// The model's reply; `None` if the model is gone.
     fn send(&self, call: Call) -> Option<Stamped> {
         self.events.send(Progress::Calling(call)).ok()?;
         self.answers.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()
     }
 
-    /// Ends a script whose variables are too large in total. The interpreter limits single values only, and
-    /// does not check all limits when an item is added.
+    /// Ends a script whose variables are too large in total. The interpreter only limits single values, and does not
+    /// check all limits when an item is added.
     fn weigh(&self, scope: &Scope<'_>, place: Position) -> ScriptResult<()> {
         if self.weigh_in.load(Relaxed) > 0 {
             return Ok(());
@@ -198,7 +197,7 @@ impl ScriptLink {
     }
 }
 
-/// Registers the bounds on work, and the publication of variables.
+/// Installs the limits on work and the publication of variables.
 pub(super) fn watch(engine: &mut Engine, link: &Arc<ScriptLink>) {
     let l = Arc::clone(link);
     // Called for each operation.
@@ -216,7 +215,7 @@ pub(super) fn watch(engine: &mut Engine, link: &Arc<ScriptLink>) {
     engine.register_debugger(
         |_, debugger| debugger,
         move |mut context, event, node, _, place| {
-            // A function's exit is reported with a scope that is not the caller's.
+            // At the exit of a function, the scope is not the caller's.
             if matches!(event, DebuggerEvent::Start | DebuggerEvent::Step) {
                 let name = match node {
                     ASTNode::Stmt(Stmt::FnCall(call, _)) | ASTNode::Expr(Expr::FnCall(call, _)) => {
@@ -248,7 +247,7 @@ fn is_abort(error: &EvalAltResult) -> bool {
     }
 }
 
-/// The value for statistics, with at most `budget` items.
+/// A value as JSON for statistics, with at most `budget` items.
 fn shown(value: &Dynamic, budget: &mut usize) -> serde_json::Value {
     use serde_json::Value;
     if *budget == 0 {
@@ -279,7 +278,7 @@ fn shown(value: &Dynamic, budget: &mut usize) -> serde_json::Value {
     }
 }
 
-/// Number of items in a value, including itself; a long string counts as several. At most `limit`.
+/// Number of items in a value, including itself, but at most `limit`; a long string counts as several.
 fn weight(value: &Dynamic, limit: usize) -> usize {
     let mut sum = 1;
     if let Some(items) = value.read_lock::<Array>() {
@@ -306,7 +305,7 @@ fn weight(value: &Dynamic, limit: usize) -> usize {
 
 /// Maximum number of items in all variables.
 const MAX_WEIGHT: usize = 65_536;
-/// Operations between two checks of it.
+/// Number of operations between two checks of the total.
 const WEIGH_EVERY: u64 = 1_000;
 /// Number of items that can be copied in the time of one operation.
 const ITEMS_AN_OPERATION: usize = 16;

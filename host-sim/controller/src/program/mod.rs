@@ -4,14 +4,14 @@
 //! In: a compiled [`Script`], and answers to its calls. Out: one [`Call`] after the other, the program's
 //! variables, and how it ended. Does not know ports, registers or motion.
 //!
-//! A script runs on a thread of its own, but never in parallel with the model: each call hands control to the
-//! model, which hands it back with the answer and waits for the next call. So a program sees the same
-//! instants in the same order in every run, whatever the speed of the machine.
+//! A script runs on a thread of its own, but never in parallel with the model: each call hands control to the model,
+//! which returns it with the reply and waits for the next call. A program thus sees the same instants in the same order
+//! in every run, however fast the machine is.
 //!
-//! A script that never waits is suspended after [`SLICE_OPERATIONS`] operations, until [`SLICE`] after the
-//! start of the slice. So everything else keeps its timing, and every run is still the same.
+//! A script that never waits is suspended after [`SLICE_OPERATIONS`] operations, until [`SLICE`] after the start of the
+//! slice. Everything else thus keeps its timing, and every run is still the same.
 //!
-//! The bounds are at the end of this file. A program that exceeds one ends with an error.
+//! The limits are at the end of this file. A program that exceeds one ends with an error.
 
 mod calls;
 mod link;
@@ -42,11 +42,11 @@ pub enum Call {
     Receive {
         /// The port's name.
         port: String,
-        /// How long at most; then [`CallReply::Done`] says that none came.
+        /// Timeout, after which the reply is [`CallReply::Done`].
         limit: Option<Duration>,
     },
-    /// Send a frame of the port's user recipe. [`CallReply::Bit`] says whether the port was ready and has sent it;
-    /// [`CallReply::Done`] is true.
+    /// Send a frame of the port's user recipe. The reply is whether the port was ready and has sent it, as
+    /// [`CallReply::Bit`]; [`CallReply::Done`] counts as true.
     Send {
         /// The port's name.
         port: String,
@@ -85,7 +85,7 @@ pub enum Call {
     Wait(Duration),
     /// Write a line to the log.
     Log(String),
-    /// Continue in the next slice. No function of a script calls this; its number of operations does.
+    /// Continue in the next slice. Scripts do not call this: it happens after too many operations.
     GiveWay {
         /// Earliest start of the next slice.
         until: Instant,
@@ -95,20 +95,20 @@ pub enum Call {
 /// The model's answer to a [`Call`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum CallReply {
-    /// It is done.
+    /// The call is done.
     Done,
     /// A received frame; on CAN with its id.
     Frame {
         /// The id.
         id: Option<CanId>,
-        /// Its fields' values.
+        /// Values of the fields.
         values: Vec<Scalar>,
     },
     /// An item's value.
     Value(Scalar),
     /// A bit's value, or whether a frame was sent.
     Bit(bool),
-    /// It failed; the program may catch the error.
+    /// The call failed; the program may catch the error.
     Error(String),
     /// The program must end.
     Abort,
@@ -117,20 +117,20 @@ pub enum CallReply {
 /// How a program ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum End {
-    /// It reached its end.
+    /// The program reached its end.
     Finished,
-    /// It was aborted.
+    /// The program was aborted.
     Aborted,
-    /// An error that it did not catch: one line, with the position in the script.
+    /// The program did not catch an error: one line, with the position in the script.
     Failed(String),
 }
 
 /// The state of a program.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Progress {
-    /// It waits for the answer to a call.
+    /// The program waits for the reply to a call.
     Calling(Call),
-    /// It has ended.
+    /// The program has ended.
     Ended(End),
 }
 
@@ -155,7 +155,7 @@ impl Program {
         Self::start_with(script, &[], now)
     }
 
-    /// The same with further scripts, which this one can call by their names.
+    /// As [`Self::start`], with further scripts that this script can call by name.
     ///
     /// # Errors
     /// If the operating system cannot create a thread.
@@ -192,7 +192,7 @@ impl Program {
         &self.progress
     }
 
-    /// Answers the pending call and runs the program up to the next one.
+    /// Answers the pending call and runs the program up to the next call.
     pub fn answer(&mut self, now: Instant, answer: CallReply) {
         if matches!(self.progress, Progress::Ended(_)) {
             return;
@@ -219,7 +219,7 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
-        // Without the channels the script's pending call returns an error that it cannot catch.
+        // Without the channels, the script's pending call returns an error that the script cannot catch.
         self.answers = None;
         self.events = None;
         if let Some(thread) = self.thread.take() {
@@ -228,7 +228,6 @@ impl Drop for Program {
     }
 }
 
-/// Runs the script to its end and reports how it ended.
 fn run(link: link::ScriptLink, script: &Script) {
     let link = Arc::new(link);
     let mut engine = script::engine();
@@ -247,7 +246,7 @@ pub const SLICE_OPERATIONS: u64 = 500;
 const CALL_OPERATIONS: u64 = 50;
 /// Maximum length of a string.
 const MAX_STRING: usize = 4_096;
-/// Maximum number of items in an array, with those of nested arrays, and in a map.
+/// Maximum number of items in an array, including nested arrays, and in a map.
 const MAX_ITEMS: usize = 1_024;
 /// Maximum number of variables.
 const MAX_VARIABLES: usize = 128;
@@ -257,7 +256,7 @@ const MAX_CALLS: usize = 24;
 const MAX_DEPTH: usize = 32;
 /// Maximum number of programs that have called one another and not returned.
 const MAX_NESTED: usize = 8;
-/// Each of the nested programs may use its depth of function calls.
+/// Each nested program may use its full depth of function calls.
 const STACK_BYTES: usize = (1 + MAX_NESTED) * (8 << 20);
 
 #[cfg(test)]

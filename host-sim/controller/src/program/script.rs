@@ -19,12 +19,12 @@ pub struct Script {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ScriptError {
     message: String,
-    /// 1-based line in the script, when it is known.
+    /// 1-based line in the script, if known.
     line: Option<usize>,
 }
 
 impl ScriptError {
-    /// 1-based line in the script, when it is known.
+    /// 1-based line in the script, if known.
     pub fn line(&self) -> Option<usize> {
         self.line
     }
@@ -63,14 +63,14 @@ impl Script {
     }
 }
 
-/// The script with this name, or with the last part of this path.
+/// The script with this name, or with the file name of this path.
 pub(crate) fn named<'a>(scripts: &'a [Script], name: &str) -> Option<&'a Script> {
     let base = name.rsplit('/').next().unwrap_or(name);
     let by = |wanted: &str| scripts.iter().find(|script| script.name() == wanted);
     by(name).or_else(|| by(base))
 }
 
-/// An interpreter with all bounds set, and without functions that read a clock or wait.
+/// An interpreter with all limits set, and without functions that read a clock or wait.
 pub(super) fn engine() -> Engine {
     let mut engine = Engine::new();
     engine
@@ -96,6 +96,6 @@ pub(super) fn engine() -> Engine {
     engine
 }
 
-/// The function `call` in a compiled script. The interpreter keeps the name `call` for function pointers, whose
+/// The name of the function `call` in a compiled script: the interpreter reserves `call` for function pointers, whose
 /// method it remains.
 pub(super) const CALL_PROGRAM: &str = "call_program";

@@ -1,10 +1,10 @@
-//! Texts of scripts on one line, short enough for a log and for a reply.
+//! Shortens texts of scripts to one line for a log or a reply.
 
 use rhai::{EvalAltResult, Position};
 
 use super::script::CALL_PROGRAM;
 
-/// The text on one line, not too long for the log.
+/// The text on one line, cut to the length of a log line.
 pub(super) fn one_line(text: &str) -> String {
     let mut line: String =
         text.chars().map(|c| if c.is_control() { ' ' } else { c }).take(MAX_LINE).collect();
@@ -12,8 +12,8 @@ pub(super) fn one_line(text: &str) -> String {
     line
 }
 
-/// What is wrong and where, on one line. A long text is cut in its middle; its place in the script, and that
-/// of the calls that led there, are always complete.
+/// The error and its place on one line. A long text is cut in the middle; the place in the script and the places of the
+/// calls are always complete.
 pub(super) fn described(error: EvalAltResult) -> String {
     let mut callers = Vec::new();
     let mut error = error;
@@ -26,7 +26,7 @@ pub(super) fn described(error: EvalAltResult) -> String {
         callers.push(format!(", {what} called at {}", shown(place)));
         error = *inner;
     }
-    // The innermost calls are the nearest to the mistake.
+    // The innermost calls are nearest to the error.
     let hidden = callers.len().saturating_sub(MAX_CALLERS);
     let mut places = callers.split_off(hidden);
     places.reverse();
@@ -44,7 +44,7 @@ fn shown(place: Position) -> String {
     if place.is_none() { "place unknown".to_owned() } else { place.to_string() }
 }
 
-/// At most `max` bytes on one line, the middle left out.
+/// At most `max` bytes on one line, with the middle omitted.
 pub(crate) fn shortened(text: &str, max: usize) -> String {
     let line: String = text.trim_end().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     if line.len() <= max {
@@ -58,14 +58,14 @@ pub(crate) fn shortened(text: &str, max: usize) -> String {
 
 /// Maximum length of a log line, in characters.
 const MAX_LINE: usize = 200;
-/// Maximum length of an error with its places, in bytes. With a program's name it fits into the reply to
-/// `getlasterror` that clients take (proto-core/docs/wire/command.md section 6).
+/// Maximum length of an error with its places, in bytes. Together with a program's name, it fits into the reply to
+/// `getlasterror` that clients accept (proto-core/docs/wire/command.md section 6).
 const MAX_ERROR: usize = 240;
-/// Maximum length of a function's name in it.
+/// Maximum length of a function's name in an error.
 const MAX_NAME: usize = 24;
-/// Maximum number of calls in it.
+/// Maximum number of calls in an error.
 const MAX_CALLERS: usize = 2;
-/// In place of what is left out.
+/// Replaces omitted text.
 const GAP: &str = " ... ";
-/// How the names of closures begin.
+/// The prefix of closures' names.
 const CLOSURE: &str = "anon$";

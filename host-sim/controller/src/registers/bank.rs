@@ -1,6 +1,6 @@
-//! The registers on Modbus (proto-core/docs/wire/modbus.md sections 7 and 8, D10-D12).
+//! The Modbus registers (proto-core/docs/wire/modbus.md sections 7 and 8, D10-D12).
 //!
-//! The places of system variables come from their table; only other items are listed here.
+//! Places of system variables come from their table; only other items are listed here.
 
 use std::sync::LazyLock;
 
@@ -11,7 +11,7 @@ use proto_core::sysvar::{ModbusPlace, SysVar};
 
 use super::Registers;
 
-/// Eight coils: every group of the map begins at a multiple of eight.
+/// Eight coils. Every group of the map begins at a multiple of eight.
 #[derive(Debug, Clone, Copy, Default)]
 struct CoilByte {
     /// Offset in the image; `None` for the tool's buttons.
@@ -56,8 +56,7 @@ static MAP: LazyLock<Map> = LazyLock::new(|| {
     for var in SysVar::all() {
         let offset = var.image_offset();
         match var.modbus() {
-            // Inputs come first, so that an output's status does not replace its command, which can be
-            // written.
+            // Inputs come first, so an output's status does not replace its command, which can be written.
             Some(ModbusPlace::Coils { first, .. }) => {
                 let byte = &mut coils[usize::from(first / 8)];
                 if byte.offset.is_none() {
@@ -128,7 +127,7 @@ impl Registers {
 }
 
 impl Registers {
-    /// Counts a read. After several without a change, the encoded registers are cached until the next one.
+    /// Counts a read. After several reads without a change, the encoded registers are cached until the next change.
     pub(crate) fn were_read(&mut self) {
         if self.shown.is_worth_keeping() {
             self.shown.keep(MAP.words.map(|word| self.word(word).to_be_bytes()));

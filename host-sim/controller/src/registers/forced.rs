@@ -1,4 +1,4 @@
-//! Items of the state packet that a test sets, in place of what the model shows there.
+//! Items of the state packet that a test sets in place of the model's values.
 
 use proto_core::wire::scalar::{Scalar, ScalarError, ScalarType};
 use proto_core::wire::state::{FIELDS, LEN};
@@ -15,8 +15,8 @@ pub(crate) struct PacketItem {
 }
 
 impl PacketItem {
-    /// The item `FIELD[N]` with N from 1, or `FIELD` if there is one only, by the names of
-    /// proto-core/docs/wire/state.md section 2; reserved ones as well.
+    /// The item `FIELD[N]` with N from 1, or `FIELD` if it has only one value, by the names of
+    /// proto-core/docs/wire/state.md section 2, including reserved items.
     pub(crate) fn named(name: &str) -> Option<Self> {
         let (field, index) = match name.strip_suffix(']').and_then(|name| name.split_once('[')) {
             Some((field, index)) => (field, Some(index.parse::<usize>().ok()?)),
@@ -31,7 +31,7 @@ impl PacketItem {
         Some(Self { offset: usize::from(place.offset) + nth * place.ty.size(), ty: place.ty })
     }
 
-    /// Its value in a packet.
+    /// The item's value in a packet.
     pub(crate) fn read(self, packet: &[u8; LEN]) -> f64 {
         let bytes = packet.get(self.offset..).unwrap_or(&[]);
         Scalar::decode(self.ty, bytes).map_or(0.0, |value| value.as_f64())
@@ -51,7 +51,7 @@ impl Forced {
     }
 
     pub(super) fn put(&self, packet: &mut [u8; LEN]) {
-        // A drive with an error is not enabled, unless its status is set as well.
+        // A drive with an error is not enabled, unless the test sets its status as well.
         let (error, status) = (offset_of("drive_error"), offset_of("drive_status"));
         for (item, value) in &self.0 {
             let is_error = (error..status).contains(&item.offset) && value.as_f64() != 0.0;

@@ -1,5 +1,5 @@
-//! Functional inputs and outputs among the registers: rising edges of inputs that can trigger a function, and
-//! bits that show a state of the controller (D27).
+//! Functional inputs and outputs among the registers: rising edges of inputs that can trigger a function, and bits that
+//! show a state of the controller (D27).
 
 use proto_core::sysvar::SysVar;
 use recipe_config::InitialTarget;
@@ -14,7 +14,7 @@ pub(super) struct Functional {
     shown: [(u8, u8); OUTPUTS.len()],
 }
 
-/// Inputs whose rising edges were seen.
+/// Inputs with a rising edge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct Risen {
     bytes: [u8; INPUTS.len()],
@@ -41,7 +41,7 @@ impl Registers {
         (risen != Risen::default()).then_some(risen)
     }
 
-    /// Shows a state in this output from now on. Nothing else can write it then.
+    /// Shows a state in this output from now on. Other writers cannot change the output then.
     pub(crate) fn show_state(&mut self, item: InitialTarget, on: bool) {
         let Some(bit) = item.var_bit() else { return };
         let place = OUTPUTS.iter().position(|&(group, index)| named(group, index) == Some(bit.var));
@@ -77,7 +77,7 @@ impl Registers {
         self.functional.risen.buttons |= self.buttons & !before;
     }
 
-    /// Puts the shown bits back, whatever was written over them.
+    /// Restores the shown bits after a write.
     pub(super) fn keep_shown(&mut self) {
         for (&offset, &(mask, bits)) in PLACES.functional_outputs.iter().zip(&self.functional.shown) {
             let byte = &mut self.image[offset];

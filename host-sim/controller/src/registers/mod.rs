@@ -1,11 +1,11 @@
-//! Every register and every input and output of the controller, in one place.
+//! All registers, inputs and outputs of the controller.
 //!
 //! In: values of recipe frames, Modbus writes and programs, and the states of the arm and the machine. Out:
 //! the same values on port 2001, Modbus, recipe ports and in programs. Does not know connections or time.
 //!
-//! System variables are in one process image, as everywhere in `proto_core`; the few other items of the
-//! Modbus map are beside it. An output that can be commanded has two variables, such as
-//! `DigitalOutputCommand[1]` and `DigitalSignalStatus[4]`: the second always follows the first.
+//! System variables are in one process image, as everywhere in `proto_core`; the few other items of the Modbus map are
+//! stored separately. An output that can be commanded has two variables, such as `DigitalOutputCommand[1]` and
+//! `DigitalSignalStatus[4]`: the second always follows the first.
 
 mod bank;
 mod forced;
@@ -39,9 +39,9 @@ pub struct MachineCodes {
     pub program: u8,
     /// Safety state.
     pub safety: u8,
-    /// The axis of a collision, while there is one (proto-core/docs/wire/state.md section 2).
+    /// The axis of a present collision (proto-core/docs/wire/state.md section 2).
     pub collision_axis: Option<u8>,
-    /// The newest error's code, 0 if there is none.
+    /// The newest error's code; 0: none.
     pub error: u32,
     /// Global speed, per cent.
     pub speed_percent: u8,
@@ -125,7 +125,7 @@ impl Registers {
         &self.image
     }
 
-    /// Lets `write` change the image, and then updates the variables that depend on others.
+    /// Lets `write` change the image, then updates dependent variables.
     pub fn write_inputs<R>(&mut self, write: impl FnOnce(&mut [u8; IMAGE_BYTES]) -> R) -> R {
         let before = (self.vector(PLACES.force_end), self.vector(PLACES.tool));
         let inputs_before = self.functional_inputs();
@@ -196,7 +196,7 @@ impl Registers {
 
     /// Sets any item: for initial values, and for inputs that a test drives.
     ///
-    /// Bits of a whole byte that show a state keep showing it.
+    /// Bits of a byte that show a state keep showing it.
     ///
     /// # Errors
     /// [`SetError::Value`] if the value is out of range, [`SetError::ShowsState`] if the item shows a state;
@@ -374,7 +374,7 @@ impl Registers {
 
 /// Offsets in the image, looked up once.
 struct ImageOffsets {
-    /// Of a command and of its status, and the valid bits.
+    /// Offsets of a command and of its status, and the valid bits.
     commanded: [(usize, usize, u8); 3],
     force_end: usize,
     force_base: usize,
@@ -404,7 +404,7 @@ static PLACES: LazyLock<ImageOffsets> = LazyLock::new(|| {
     }
 });
 
-/// Whether the variable keeps what was written to it: it is neither measured nor an input.
+/// Whether the variable keeps a written value: it is neither measured nor an input.
 fn is_kept(var: SysVar) -> bool {
     match var.group() {
         "RobotState" => false,
@@ -413,7 +413,7 @@ fn is_kept(var: SysVar) -> bool {
     }
 }
 
-/// The command of the output whose status is `var`; `None` if `var` is something else.
+/// The command of the output whose status is `var`; `None` if `var` is not a status.
 fn command_of(var: SysVar) -> Option<SysVar> {
     if var.direction() == Direction::Input || var.group() != "DigitalSignalStatus" {
         return None;
@@ -422,7 +422,7 @@ fn command_of(var: SysVar) -> Option<SysVar> {
     named("DigitalOutputCommand", *command)
 }
 
-/// The byte variable that holds bit `nth` (from 0) of the group; `None` for the buttons.
+/// The byte variable that holds bit `nth` (from 0) of the group; `None` for buttons.
 fn byte_of(group: BitGroup, nth: u8) -> Option<SysVar> {
     group.var_bit(nth + 1).map(|bit| bit.var)
 }

@@ -55,7 +55,7 @@ impl Registers {
             *value = unscaled(counts, if nth < 4 { COUNTS_PER_MA } else { COUNTS_PER_V });
         }
         let mut bytes = Box::new([0; LEN]);
-        // It cannot fail: the buffer has a packet's length.
+        // Cannot fail: the buffer has a packet's length.
         let _ = packet.encode(&mut bytes[..]);
         self.put_variables(&mut bytes);
         if let Some(place) = global_speed.and_then(|offset| bytes.get_mut(usize::from(offset))) {
@@ -65,7 +65,7 @@ impl Registers {
         bytes
     }
 
-    /// What the arm and its payload weigh in the present position and motion.
+    /// Loads of the arm and its payload in the present position and motion.
     fn loads(&self) -> Loads {
         let [mass_kg, centre_m @ ..] = self.payload();
         let [x, y, z, ..] = self.arm.tcp_acceleration.map(f64::from);
@@ -73,7 +73,7 @@ impl Registers {
         Loads::of(&[q1, q2, q3, q4, q5, q6], [x, y, z], &Payload { mass_kg, centre_m })
     }
 
-    /// Shows this value in packets from now on, whatever the model shows there.
+    /// Shows this value in packets from now on, in place of the model's value.
     pub(crate) fn force_in_packet(&mut self, item: PacketItem, value: f64) -> Result<(), ScalarError> {
         self.forced.set(item, value)
     }
@@ -99,7 +99,7 @@ impl Registers {
     }
 }
 
-/// Where a variable is.
+/// The place of a variable.
 struct PacketRange {
     image: Range<usize>,
     packet: Range<usize>,

@@ -1,14 +1,13 @@
-//! The holding registers as the wire has them, kept while none of them changes.
+//! A cache of the encoded holding registers, valid while no register changes.
 
 use super::bank::WORDS;
 
-/// The holding registers as they were read.
 #[derive(Debug, Clone)]
 pub(super) struct ShownWords {
     words: [[u8; 2]; WORDS],
-    /// They are as the registers are now.
+    /// Whether the words equal the registers.
     are_current: bool,
-    /// Reads since a register changed, as far as they are counted.
+    /// Reads since a register changed, counted up to a limit.
     reads: u8,
 }
 
@@ -19,7 +18,7 @@ impl Default for ShownWords {
 }
 
 impl ShownWords {
-    /// All of them; `None` if they have to be asked for one by one.
+    /// All registers; `None` if they must be read one by one.
     pub(super) fn get(&self) -> Option<&[[u8; 2]; WORDS]> {
         self.are_current.then_some(&self.words)
     }
@@ -29,8 +28,8 @@ impl ShownWords {
         (self.are_current, self.reads) = (false, 0);
     }
 
-    /// Counts a read. True if it is time to [`Self::keep`] the registers: not yet at the first ones, because of clients
-    /// that read a few registers each time that they change.
+    /// Counts a read. True once the registers are to be cached: not at the first reads, because of clients that read a
+    /// few registers after each change.
     pub(super) fn is_worth_keeping(&mut self) -> bool {
         if self.are_current {
             return false;

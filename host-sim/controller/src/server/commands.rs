@@ -1,8 +1,8 @@
-//! Port 2000: the commands of a connection are executed one after the other, and answered when they are
-//! done (proto-core/docs/wire/command.md section 8, D25).
+//! Port 2000: executes the commands of a connection one after the other, and answers each when it is done
+//! (proto-core/docs/wire/command.md section 8, D25).
 //!
-//! A command that begins a transition is answered at its end. Until then further commands of the connection
-//! wait; other connections are served.
+//! A command that begins a transition is answered at the end of the transition. Until then, further commands of the
+//! connection wait; other connections are served.
 
 use std::collections::VecDeque;
 
@@ -23,7 +23,7 @@ use crate::{ConnId, Controller, ControllerOutput};
 #[derive(Debug, Default)]
 pub(super) struct Session {
     parser: CommandServer,
-    /// Commands that wait until the one before is answered.
+    /// Commands that wait for the answer to the previous one.
     waiting: VecDeque<(Command, EventText)>,
     pending: Option<Pending>,
     current: EventText,
@@ -36,7 +36,7 @@ type EventText = Option<String>;
 #[derive(Debug, Clone, Copy)]
 struct Pending {
     transition: Transition,
-    /// It is answered with fail at this time.
+    /// After this time, the command is answered with fail.
     until: Instant,
 }
 
@@ -73,7 +73,7 @@ impl From<ServerEvent<'_>> for Command {
 }
 
 impl Session {
-    /// When silence completes a command, or the time limit of a transition is reached.
+    /// When silence completes a command, or the time limit of a transition expires.
     pub(super) fn deadline(&self) -> Option<Instant> {
         let pending = self.pending.map(|pending| pending.until);
         [self.parser.deadline(), pending].into_iter().flatten().min()
@@ -131,8 +131,8 @@ impl Controller {
         self.settle(now);
     }
 
-    /// Answers commands whose transitions have ended, and executes those that waited. To be called after
-    /// every change of the state machines.
+    /// Answers commands whose transitions have ended, and executes waiting commands. Call it after every change of the
+    /// state machines.
     pub(crate) fn settle(&mut self, now: Instant) {
         self.note_states(now);
         while let Some((conn, step)) = self.next_step(now) {
@@ -233,7 +233,7 @@ impl Controller {
         }
     }
 
-    /// The command `run`. The program is looked up first, so that a missing one is reported in every state.
+    /// The command `run`. The program is looked up first, so a missing program is reported in every state.
     pub(crate) fn run(
         &mut self,
         now: Instant,
@@ -295,9 +295,9 @@ fn text_of(event: &ServerEvent<'_>, dialect: &Dialect) -> String {
     String::from_utf8_lossy(bytes).trim_end().to_owned()
 }
 
-/// The command of a longer transition is answered with fail; the transition continues.
+/// Time limit of a transition: its command is answered with fail, and the transition continues.
 const MAX_TRANSITION: Duration = Duration::from_secs(5);
-/// Maximum number of commands that wait on a connection; one more closes it.
+/// Maximum number of waiting commands of a connection; a further command closes it.
 pub const MAX_ORDERS: usize = 64;
 /// Maximum length of a reply, with an error's text.
 const MAX_REPLY: usize = 1_024;

@@ -1,7 +1,7 @@
 //! The controller's TCP servers and its UDP server (docs/simulated-controller.md section 5).
 //!
-//! The number of connections is bounded; one more is closed at once and counted. An answer is sent as
-//! a whole; the runtime sends it as fast as the connection takes it.
+//! The number of connections is bounded; a further connection is closed at once and counted. A reply is sent as a
+//! whole; the runtime sends it as fast as the connection accepts it.
 
 mod commands;
 mod displacement;
@@ -29,7 +29,7 @@ pub const MAX_COMMAND_CONNECTIONS: usize = 32;
 pub const MAX_STATE_CONNECTIONS: usize = 32;
 /// Maximum number of Modbus clients.
 pub const MAX_MODBUS_CONNECTIONS: usize = 128;
-/// Maximum number of answers that a fault delays; further ones are dropped.
+/// Maximum number of replies that a fault delays; further replies are dropped.
 const MAX_DELAYED: usize = 1_024;
 
 #[derive(Debug, Default)]
@@ -118,7 +118,7 @@ impl Controller {
         }
     }
 
-    /// Whether one more client is accepted. Another one may be disconnected for it.
+    /// Whether a further client is accepted. Another client may be disconnected for it.
     fn displace(&mut self, now: Instant, link: Link, from: IpAddr) -> bool {
         let open = self.server.open(link);
         match (link, self.faults.command_clients()) {
@@ -158,8 +158,8 @@ impl Controller {
         self.server.places.closed(conn);
     }
 
-    /// Answers the requests in these bytes. Returns the values before the first write, if there was one and writes are
-    /// recorded.
+    /// Answers the requests in these bytes. Returns the values before the first write, if there was a write and writes
+    /// are recorded.
     pub(super) fn modbus_bytes(
         &mut self,
         now: Instant,
@@ -247,11 +247,11 @@ impl Controller {
             return ResponseTiming::Never;
         }
         counters.bytes_out += bytes.len() as u64;
-        // Answers of a connection stay in order.
+        // Replies on a connection stay in order.
         let earlier = self.server.delayed.iter().rev().find(|delayed| delayed.1 == conn);
         let due = (now + self.faults.delay(link)).max(earlier.map_or(now, |delayed| delayed.0));
         if due <= now && earlier.is_none() {
-            // Answers to requests that arrived together are sent together.
+            // Replies to requests that arrived together are sent together.
             match self.outputs.back_mut() {
                 Some(ControllerOutput::Send { conn: last, bytes: waiting })
                     if *last == conn && waiting.len() < MAX_JOINED =>
@@ -271,11 +271,11 @@ impl Controller {
     }
 }
 
-/// What Modbus requests have done beside being answered.
+/// The effect of Modbus requests, besides their replies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Requested {
     Nothing,
-    /// Something that [`Controller::advance`] may have to look at.
+    /// [`Controller::advance`] may have something to do.
     Changes,
 }
 
@@ -333,5 +333,5 @@ impl RegisterBank for FaultyBank<'_> {
     }
 }
 
-/// Answers are joined up to about this number of bytes.
+/// Maximum number of bytes, approximately, up to which replies are joined.
 const MAX_JOINED: usize = 4_096;

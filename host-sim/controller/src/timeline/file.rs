@@ -16,7 +16,7 @@ use crate::condition::Condition;
 use crate::operations::{Operation, Refused, time};
 
 impl Timeline {
-    /// Reads a timeline for this controller. `name` is the file's name in messages.
+    /// Reads a timeline for a controller of this configuration. `name` is the file's name in messages.
     ///
     /// # Errors
     /// The first mistake, with its place.
@@ -123,7 +123,7 @@ impl File<'_> {
         let named = |text: &str| find(table, text).map(|(path, at)| (format!("{key}.{path}"), at));
         let quoted = |quote: char| error.0.split(quote).nth(1).and_then(named);
         let before = error.0.split_once(": ").and_then(|(name, message)| Some((named(name)?, message)));
-        // The place has the name already.
+        // The place already includes the name.
         let (place, message) = match before {
             Some((place, message)) => (Some(place), message),
             None => (quoted('`').or_else(|| quoted('"')), error.0.as_str()),
@@ -152,7 +152,7 @@ impl File<'_> {
     }
 }
 
-/// A controller of the same configuration, on which operations are tried that depend on no state.
+/// A controller of the same configuration, to check operations that do not depend on its state.
 struct TrialController {
     controller: Controller,
 }
@@ -170,7 +170,7 @@ impl TrialController {
                     "a timeline does only what changes something; use `when` to wait".into(),
                 ));
             }
-            // These depend on the state, and on the programs that are there then.
+            // These depend on the state, and on the programs that exist then.
             Operation::Run { .. }
             | Operation::Remove { .. }
             | Operation::Stop {}
@@ -187,7 +187,7 @@ impl TrialController {
     }
 }
 
-/// The path and the place of the first key or string of this text.
+/// The path and the place of the first key or string with this text.
 fn find(table: &DeTable<'_>, text: &str) -> Option<(String, usize)> {
     table.iter().find_map(|(key, value)| {
         let name = key.get_ref();
@@ -209,7 +209,7 @@ fn find_in(value: &Spanned<DeValue<'_>>, text: &str) -> Option<(String, usize)> 
     }
 }
 
-/// The same value in JSON; or the place of one that JSON does not have.
+/// The value as JSON, or the place of a value that JSON does not have.
 fn json(value: &Spanned<DeValue<'_>>) -> Result<Value, (usize, String)> {
     let wrong = |message: &str| (value.span().start, message.to_owned());
     Ok(match value.get_ref() {
@@ -235,5 +235,5 @@ fn json(value: &Spanned<DeValue<'_>>) -> Result<Value, (usize, String)> {
 }
 
 const UNKNOWN: &str = "unknown key; a timeline has only steps, written [[step]]";
-/// The time of all trials.
+/// The time of all checks.
 const NOW: Instant = Instant::from_millis(1);

@@ -1,11 +1,11 @@
 //! Inverse kinematics: from the flange's frame to the joints.
 //!
-//! The arm has three parallel axes in the middle and a wrist whose last two axes cross the others at right
-//! angles, so each frame has up to eight exact solutions: [`Branch`] says which.
+//! The arm has three parallel axes in the middle, and the last two axes of its wrist cross the others at right angles.
+//! Each frame thus has up to eight exact solutions, which [`Branch`] distinguishes.
 
 use super::{JOINTS, LINKS, Pose, cross};
 
-/// Which of the solutions: shoulder, elbow and wrist are each one way round or the other.
+/// One of the solutions: shoulder, elbow and wrist can each be in two positions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::motion) struct Branch {
     shoulder: Way,
@@ -37,8 +37,8 @@ impl Branch {
 }
 
 impl Pose {
-    /// The joints, in rad and somewhere within a turn, with which the flange has this frame; `None` if the
-    /// arm does not reach it, or if joint 5 is straight, which leaves joint 6 undefined.
+    /// The joint positions, in rad and within one turn, at which the flange has this frame; `None` if the arm does not
+    /// reach it, or if joint 5 is straight, which leaves joint 6 undefined.
     pub(in crate::motion) fn joints(&self, branch: Branch) -> Option<[f64; JOINTS]> {
         let [base, upper, fore, side, wrist, flange] = &LINKS;
         let r = &self.rotation;
@@ -54,7 +54,7 @@ impl Pose {
             return None;
         }
         let q6 = libm::atan2((-r[0][1] * s1 + r[1][1] * c1) / s5, (r[0][0] * s1 - r[1][0] * c1) / s5);
-        // What is left for the three parallel axes, seen from the first link.
+        // The part of the three parallel axes, seen from the first link.
         let after = wrist.at(q5).then(&flange.at(q6));
         let middle = base.at(q1).inverse().then(self).then(&after.inverse());
         let [px, py, _] = middle.origin;
@@ -66,7 +66,7 @@ impl Pose {
         Some([q1, q2, q3, q4, q5, q6])
     }
 
-    /// The frame that undoes this one.
+    /// The inverse of this frame.
     pub(in crate::motion) fn inverse(&self) -> Self {
         let r = &self.rotation;
         let rotation = [0, 1, 2].map(|row| [r[0][row], r[1][row], r[2][row]]);
@@ -75,7 +75,7 @@ impl Pose {
         Self { origin: [-x, -y, -z], ..turned }
     }
 
-    /// From this frame's origin to the other's, in the parent's axes, m.
+    /// The vector from this frame's origin to the other's, in the parent's axes, m.
     pub(in crate::motion) fn way_to(&self, other: &Self) -> [f64; 3] {
         [0, 1, 2].map(|nth| other.origin[nth] - self.origin[nth])
     }
@@ -101,7 +101,7 @@ impl Pose {
         (axis.map(|item| item / length), angle)
     }
 
-    /// This frame moved by `way` in the parent's axes and turned about an own axis.
+    /// This frame moved by `way` in the parent's axes and rotated about an axis of its own.
     pub(in crate::motion) fn moved(&self, way: [f64; 3], axis: &[f64; 3], angle: f64) -> Self {
         let (s, c) = libm::sincos(angle);
         let columns = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|unit| {
@@ -120,7 +120,7 @@ pub(in crate::motion) fn length(vector: &[f64; 3]) -> f64 {
     vector.iter().map(|item| item * item).sum::<f64>().sqrt()
 }
 
-/// `None` outside -1..=1, with room for rounding errors.
+/// Arc cosine; `None` outside -1..=1, with a tolerance for rounding errors.
 fn checked_acos(cosine: f64) -> Option<f64> {
     (cosine.abs() <= 1.0 + 1e-12).then(|| libm::acos(cosine.clamp(-1.0, 1.0)))
 }
