@@ -1,7 +1,7 @@
-//! The calls of the engine in an MCAP file, whatever the file holds.
+//! The calls of the engine in an MCAP file, which may be damaged.
 //!
-//! In: a file of a recording ([`crate::recording`]), also a damaged one. Out: each call with its number. Chunks are
-//! taken apart here: the library's reader does not check that the records in a chunk end where it does.
+//! In: a file of a recording ([`crate::recording`]). Out: each call with its number. Chunks are parsed here: the
+//! library's reader does not check that the records in a chunk end where it does.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -13,10 +13,10 @@ use mcap::{McapError, parse_record};
 
 use crate::recording::ENGINE;
 
-/// Takes a call and its number.
+/// Receives a call and its number.
 pub(crate) type Take<'t, E> = dyn FnMut(u32, &[u8]) -> Result<Then, E> + 't;
 
-/// What becomes of the file after a call.
+/// Whether to read on after a call.
 pub(crate) enum Then {
     GoOn,
     Stop,
@@ -26,7 +26,7 @@ pub(crate) enum Then {
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum RecordingEnd {
     Whole,
-    /// Within a record, or where nothing can be read.
+    /// Within a record, or at something unreadable.
     Cut,
     /// The visitor returned `Stop`.
     Stopped,
@@ -35,7 +35,7 @@ pub(crate) enum RecordingEnd {
 /// Visits each call with its number.
 pub(crate) fn each<E>(mut file: File, take: &mut Take<'_, E>) -> Result<RecordingEnd, E> {
     let Ok(len) = file.metadata().map(|found| found.len()) else { return Ok(RecordingEnd::Cut) };
-    // The file of a killed process has no end. A damaged one may name a length that no memory has.
+    // The file of a killed process has no end. A damaged file may contain a length that exceeds the memory.
     let options = LinearReaderOptions::default()
         .with_skip_end_magic(true)
         .with_emit_chunks(true)
@@ -65,7 +65,7 @@ pub(crate) fn each<E>(mut file: File, take: &mut Take<'_, E>) -> Result<Recordin
 struct Channels(BTreeSet<u16>);
 
 impl Channels {
-    /// A record, which may have others in it.
+    /// Reads a record, which may contain others.
     fn record<E>(&mut self, opcode: u8, data: &[u8], take: &mut Take<'_, E>) -> Result<RecordingEnd, E> {
         if !matches!(opcode, op::CHANNEL | op::MESSAGE | op::CHUNK) {
             return Ok(RecordingEnd::Whole);
@@ -84,7 +84,7 @@ impl Channels {
                     return Ok(RecordingEnd::Stopped);
                 }
             }
-            // A recording has no compressed ones.
+            // Chunks of a recording are not compressed.
             Ok(Record::Chunk { header, data }) if header.compression.is_empty() => {
                 return self.chunk(&data, take);
             }
@@ -100,7 +100,7 @@ impl Channels {
             let len = usize::try_from(u64::from_le_bytes(*len)).unwrap_or(usize::MAX);
             let Some((data, behind)) = behind.split_at_checked(len) else { return Ok(RecordingEnd::Cut) };
             rest = behind;
-            // None is in another one.
+            // Chunks are not nested.
             if *opcode == op::CHUNK {
                 return Ok(RecordingEnd::Cut);
             }

@@ -1,7 +1,7 @@
 //! A capture as a file or on a pipe, written by a thread of its own.
 //!
-//! In: a subscription. Out: pcapng. What cannot be written ends the capture, and nothing else: a file then ends with
-//! its last whole packet.
+//! In: a subscription. Out: pcapng. A failed write ends the capture, but nothing else: the file then ends with its last
+//! whole packet.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -15,12 +15,12 @@ use tracing::{info, warn};
 use crate::pcapng::{MAGIC, Pcapng, Scope};
 use crate::watch::{Interest, Next, Subscription, Watch};
 
-/// Where a capture goes.
+/// The destination of a capture.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Target {
     /// Standard output.
     Stdout,
-    /// A file, a pipe with a name or a device. A capture that is there is replaced.
+    /// A file, a named pipe or a device. An existing capture is replaced.
     Path(PathBuf),
 }
 
@@ -31,10 +31,10 @@ pub struct CaptureFile {
 }
 
 impl CaptureFile {
-    /// Begins a capture of what `watch` tells from now on.
+    /// Starts a capture of the records of `watch` from now on.
     ///
     /// # Errors
-    /// If the file cannot be made, or something else than a capture is there.
+    /// If the file cannot be created, or the path holds something other than a capture.
     pub fn start(watch: &Watch, scope: Scope, target: Target) -> io::Result<Self> {
         let open = match &target {
             Target::Stdout => None,
@@ -43,7 +43,7 @@ impl CaptureFile {
         let subscription = watch.subscribe(Interest { frames: true, passes: false }, ROOM);
         let (end, ended) = channel();
         std::thread::Builder::new().name("capture".to_owned()).spawn(move || {
-            // Dropped behind the subscription.
+            // Dropped after the subscription.
             let _end: std::sync::mpsc::Sender<()> = end;
             let subscription = subscription;
             let name = match &target {
@@ -52,7 +52,7 @@ impl CaptureFile {
             };
             let result = match (target, open) {
                 (Target::Path(_), Some(Opened::File(file))) => write_file(file, scope, &subscription),
-                // Waits until somebody reads.
+                // Waits for a reader.
                 (Target::Path(path), _) => File::options()
                     .write(true)
                     .open(path)
@@ -70,8 +70,7 @@ impl CaptureFile {
         Ok(Self { ended })
     }
 
-    /// Waits until everything is written, for 2 s at most: whoever reads may have stopped. Close the watch
-    /// before.
+    /// Waits at most 2 s until everything is written: the reader may have stopped. Close the watch before.
     pub fn finish(self) {
         let _ = self.ended.recv_timeout(PATIENCE);
     }
@@ -83,7 +82,7 @@ enum Opened {
     Pipe,
 }
 
-/// Refuses a path at which something else is than a capture, or nothing.
+/// Checks that nothing is at the path, or a capture that may be replaced.
 ///
 /// # Errors
 /// Why nothing may be written there.
@@ -108,7 +107,7 @@ pub fn replaceable(path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Opens a file, unless that would replace something else than a capture.
+/// Opens a file, if it is new or replaces a capture.
 fn check(path: &Path) -> io::Result<Opened> {
     replaceable(path)?;
     if let Ok(found) = fs::metadata(path)
@@ -122,12 +121,12 @@ fn check(path: &Path) -> io::Result<Opened> {
 fn write_file(mut file: File, scope: Scope, subscription: &Subscription) -> io::Result<()> {
     let mut whole = 0;
     write_all(&mut file, scope, subscription, &mut whole).inspect_err(|_| {
-        // Not with half a packet at the end.
+        // Remove a partial packet at the end.
         let _ = file.set_len(whole);
     })
 }
 
-/// Writes everything until the watch is closed. `whole` counts the bytes of what was written as a whole.
+/// Writes everything until the watch is closed. `whole` counts the bytes up to the last complete write.
 fn write_all(
     out: &mut dyn Write,
     scope: Scope,
@@ -141,7 +140,7 @@ fn write_all(
             Next::Nothing => continue,
             Next::End => return Ok(()),
         };
-        // What waits is written at once.
+        // All waiting records are written at once.
         while blocks.len() < AT_ONCE
             && let Next::Record(arrived) = subscription.next(Duration::ZERO)
         {
@@ -153,12 +152,12 @@ fn write_all(
     }
 }
 
-/// Records that may wait for the disk.
+/// Maximum number of records that wait for the disk.
 const ROOM: usize = 16_384;
-/// Bytes that are written at once.
+/// Maximum number of bytes written at once.
 const AT_ONCE: usize = 256 << 10;
 const WAIT: Duration = Duration::from_secs(1);
-/// How long the end of a capture waits for its reader.
+/// How long the end of a capture waits for the reader.
 const PATIENCE: Duration = Duration::from_secs(2);
 
 #[cfg(test)]
@@ -220,7 +219,7 @@ mod tests {
         let capture = CaptureFile::start(&watch, Scope::default(), full).unwrap();
         deliver(&watch, 10);
         capture.finish();
-        // Nobody is interested any more, so nothing costs anything.
+        // Nothing is recorded without subscribers.
         assert_eq!(watch.wanted(), Interest::default());
         deliver(&watch, 10);
     }

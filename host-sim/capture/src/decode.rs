@@ -1,6 +1,6 @@
-//! Frames as values by name: what a recording and a live view show.
+//! Decodes frames to values by name, for recordings and live views.
 //!
-//! In: a frame of a port, and the frames of the file that the gateway runs. Out: which of them it is, and its values
+//! In: a frame of a port, and the frames of the file that the gateway runs. Out: the kind of the frame, and its values
 //! as JSON. Names are those of `recipe_export::names`.
 
 use proto_core::device::{Element, Kind};
@@ -16,7 +16,7 @@ use serde_json::{Map, Value, json};
 
 use crate::frame::Frame;
 
-/// Knows the frames of a file; by default of one that has none.
+/// Decodes the frames of a file; the default decoder knows no frames.
 #[derive(Debug, Clone, Default)]
 pub struct Decoder {
     ports: Vec<PortTopics>,
@@ -34,16 +34,16 @@ struct PortTopics {
 pub struct Topic {
     /// Port, part and, on CAN, id: `/rs485__1/input`, `/hand/input/502`.
     pub name: String,
-    /// The recipe, and what the frame is for.
+    /// The recipe, and the purpose of the frame.
     pub title: String,
-    /// A JSON Schema of its values.
+    /// JSON Schema of the values.
     pub schema: Value,
     format: Format,
     names: Vec<Option<String>>,
 }
 
 impl Decoder {
-    /// The frames of this file's ports.
+    /// A decoder for the frames of this file's ports.
     pub fn new(model: &Model) -> Self {
         let ports = model.ports.iter().map(|port| {
             let recipe = model.recipe_of(port);
@@ -59,7 +59,7 @@ impl Decoder {
                         Some(CanId::Standard(id)) => format!("/{id:03X}"),
                         Some(CanId::Extended(id)) => format!("/{id:08X}"),
                     };
-                    // Frames that only their constants tell apart.
+                    // Frames that differ only in constants.
                     if several(format) {
                         name += &format!("/{nth}");
                     }
@@ -75,7 +75,7 @@ impl Decoder {
         Self { ports: ports.collect() }
     }
 
-    /// The values of a frame of a port; `None` if it is none that the file has.
+    /// The values of a frame of a port; `None` if the file has no such frame.
     pub fn decode(&self, port: &str, frame: &Frame) -> Option<(&Topic, Value)> {
         let direction = match frame.direction {
             TapDirection::In => Direction::Input,
@@ -89,7 +89,7 @@ impl Decoder {
     }
 }
 
-/// A frame of Modbus TCP as it would be on a line, which the file's frames are.
+/// A frame of Modbus TCP in the form of a serial line, which the file's frames have.
 fn as_on_line(frame: &Frame) -> Option<Frame> {
     let mut bytes = frame.bytes.get(HEADER_LEN - 1..).filter(|_| frame.len == frame.bytes.len())?.to_vec();
     bytes.extend(rtu::checksum(&bytes).to_le_bytes());
@@ -118,7 +118,7 @@ impl Topic {
         Self { name, title, schema, format: format.clone(), names }
     }
 
-    /// The values of a frame, if it is one of these.
+    /// The values of a frame, if it has this format.
     fn values(&self, frame: &Frame) -> Option<Value> {
         if frame.len != frame.bytes.len() {
             return None;
@@ -152,11 +152,11 @@ fn json_type(element: &Element) -> &'static str {
     }
 }
 
-/// A number; what is infinite or not a number is null.
+/// A number; null for infinities and NaN.
 fn to_json(scalar: Scalar) -> Value {
     match scalar {
         Scalar::Float(_) | Scalar::Double(_) => json!(scalar.as_f64()),
-        // All integers are exact in a binary64.
+        // All integers are exact in a binary64 float.
         _ => json!(scalar.as_f64() as i64),
     }
 }

@@ -1,4 +1,4 @@
-//! One frame that was seen.
+//! A recorded frame.
 
 use proto_core::engine::{TapDirection, TapPlace, TapVerdict};
 use proto_core::wire::can::CanId;
@@ -10,17 +10,17 @@ pub struct Frame {
     pub place: TapPlace,
     /// The direction.
     pub direction: TapDirection,
-    /// Whether it was accepted.
+    /// Whether the frame was accepted.
     pub verdict: TapVerdict,
-    /// Its id on CAN.
+    /// The id on CAN.
     pub can_id: Option<CanId>,
-    /// Length in bytes; more than in `bytes` if that was cut.
+    /// Length in bytes; more than in `bytes` if these were truncated.
     pub len: usize,
     /// The bytes.
     pub bytes: Box<[u8]>,
 }
 
-/// Why a frame was rejected, in words; `None` if it was not.
+/// Why a frame was rejected, in words; `None` if it was accepted.
 pub fn rejection(frame: &Frame) -> Option<&'static str> {
     match frame.verdict {
         TapVerdict::Rejected(why) => Some(why.text()),

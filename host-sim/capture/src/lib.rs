@@ -1,8 +1,8 @@
-//! Captures and recordings of what goes over the gateway's ports and links.
+//! Captures and recordings of the traffic on the gateway's ports and links.
 //!
-//! In: records of frames and of the engine's passes, which the gateway runtime gives to a [`Watch`]. Out: captures
-//! for Wireshark ([`pcapng`]), recordings of a whole run ([`recording`]), and the run again in virtual time
-//! ([`replay`]). Nothing here runs on the gateway's thread, and nothing delays it.
+//! In: records of frames and of the engine's passes, which the gateway runtime delivers to a [`Watch`]. Out: captures
+//! for Wireshark ([`pcapng`]), recordings of a whole run ([`recording`]), and replays of a run in virtual time
+//! ([`replay`]). Nothing here runs on the gateway's thread or delays it.
 
 #![forbid(unsafe_code)]
 

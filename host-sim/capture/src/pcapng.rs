@@ -1,8 +1,8 @@
 //! Captures for Wireshark: pcapng, one interface for each port.
 //!
 //! In: records. Out: the blocks of a file, or of a stream. CAN frames are those of SocketCAN
-//! (`LINKTYPE_CAN_SOCKETCAN`); what goes over a serial line or a link to the controller is `LINKTYPE_USER0`, which
-//! the plugin of `host-sim export lua` shows. The comment of a packet says why it was rejected.
+//! (`LINKTYPE_CAN_SOCKETCAN`). Traffic of serial lines and of links to the controller is `LINKTYPE_USER0`, which the
+//! plugin of `host-sim export lua` shows. The comment of a packet says why it was rejected.
 
 use std::sync::Arc;
 
@@ -19,9 +19,9 @@ pub const MAGIC: [u8; 4] = [0x0A, 0x0D, 0x0D, 0x0A];
 /// What is captured.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Scope {
-    /// Only this port; all if `None`.
+    /// Only this port; `None`: all ports.
     pub port: Option<String>,
-    /// The links to the controller too.
+    /// Whether links to the controller are included.
     pub links: bool,
 }
 
@@ -29,7 +29,7 @@ pub struct Scope {
 #[derive(Debug)]
 pub struct Pcapng {
     scope: Scope,
-    /// Written, and not yet taken.
+    /// Bytes not taken yet.
     bytes: Vec<u8>,
     /// Name and link type of each interface so far.
     interfaces: Vec<(String, u16)>,
@@ -41,7 +41,7 @@ impl Pcapng {
     pub fn new(scope: Scope) -> Self {
         let mut new = Self { scope, bytes: Vec::new(), interfaces: Vec::new(), cell: None };
         let mut section = Block::new(u32::from_le_bytes(MAGIC));
-        // The magic tells the byte order. Then version 1.0, and a length that is not known.
+        // The magic number shows the byte order. It is followed by version 1.0, and by an unknown length.
         section.put(&0x1A2B_3C4D_u32.to_le_bytes());
         section.put(&1_u16.to_le_bytes());
         section.put(&0_u16.to_le_bytes());
@@ -51,7 +51,7 @@ impl Pcapng {
         new
     }
 
-    /// The blocks for a record, with those before it that are needed; often empty.
+    /// The blocks of a record, including the blocks that it requires before it; often empty.
     pub fn blocks(&mut self, arrived: &Arrived) -> Vec<u8> {
         let Record { at, lost, what } = &*arrived.record;
         match what {
@@ -70,7 +70,7 @@ impl Pcapng {
         std::mem::take(&mut self.bytes)
     }
 
-    /// Describes the interfaces before any packet, so that all of them are seen at once.
+    /// Describes the interfaces before any packet, so a reader sees all of them at once.
     fn describe_all(&mut self, cell: &Cell) {
         for port in &cell.ports {
             self.interface(cell, TapPlace::Port(port.id));
@@ -80,7 +80,7 @@ impl Pcapng {
         }
     }
 
-    /// The number of the interface of a port or link, if it is to be captured.
+    /// The number of the interface of a port or link, if it is captured.
     fn interface(&mut self, cell: &Cell, place: TapPlace) -> Option<u32> {
         let (name, link_type, bit_rate) = match place {
             TapPlace::Port(id) => {
@@ -99,7 +99,7 @@ impl Pcapng {
             let mut block = Block::new(INTERFACE);
             block.put(&link_type.to_le_bytes());
             block.put(&[0; 2]);
-            // No limit of packets.
+            // No limit on packet length.
             block.put(&0_u32.to_le_bytes());
             block.option(INTERFACE_NAME, name.as_bytes());
             // Times are in nanoseconds.
@@ -155,10 +155,10 @@ const PACKET_DROP_COUNT: u16 = 4;
 const LINKTYPE_USER0: u16 = 147;
 const LINKTYPE_CAN_SOCKETCAN: u16 = 227;
 
-/// A block: its type, its length before and behind what it holds, all little-endian and in units of four bytes.
+/// A block: its type, and its length before and after its content, little-endian, in units of four bytes.
 struct Block {
     bytes: Vec<u8>,
-    /// An option was written, so their end has to be.
+    /// An option was written, so the end of options is needed.
     has_options: bool,
 }
 
@@ -177,7 +177,7 @@ impl Block {
         self.bytes.resize(self.bytes.len().next_multiple_of(4), 0);
     }
 
-    /// Adds an option of at most 65535 bytes; a longer one is left out.
+    /// Adds an option of at most 65535 bytes; a longer option is omitted.
     fn option(&mut self, code: u16, value: &[u8]) {
         let Ok(len) = u16::try_from(value.len()) else { return };
         self.put(&code.to_le_bytes());
@@ -201,7 +201,7 @@ impl Block {
 /// Id, length and three zeros before the data.
 const SOCKETCAN_HEADER: usize = 8;
 
-/// A CAN frame as SocketCAN has it, the id with its flags in network order.
+/// A CAN frame in the format of SocketCAN; id and flags are in network byte order.
 fn socketcan(id: CanId, frame: &Frame) -> Vec<u8> {
     let mut word = match id {
         CanId::Standard(id) => u32::from(id),

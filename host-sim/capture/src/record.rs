@@ -1,4 +1,4 @@
-//! What was seen at the gateway's engine: frames at its ports and links, and passes of the engine itself.
+//! Records of the gateway's engine: frames at its ports and links, and passes of the engine itself.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -10,26 +10,26 @@ use proto_core::time::Instant;
 use crate::decode::Decoder;
 use crate::frame::Frame;
 
-/// One thing that was seen.
+/// One record.
 #[derive(Debug, Clone)]
 pub struct Record {
-    /// When, on the engine's clock.
+    /// Time on the engine's clock.
     pub at: Instant,
-    /// Number of records of the same kind that were lost before this one, for all subscribers.
+    /// Number of records of the same kind lost before this one for all subscribers.
     pub lost: u32,
-    /// What was seen.
+    /// The content.
     pub what: What,
 }
 
-/// What was seen.
+/// The content of a record.
 #[derive(Debug, Clone)]
 pub enum What {
     /// An engine starts, with these ports and links. Each subscriber gets this record first.
     Began(Arc<Cell>),
     /// A frame, bytes or a datagram.
     Frame(Frame),
-    /// One call of the engine and what it did, as entries of a recording (`proto_core::record`); the first one
-    /// of an engine is its start.
+    /// One call of the engine and its effects, as entries of a recording (`proto_core::record`). The first call of an
+    /// engine is its start.
     Pass(Box<[u8]>),
 }
 
@@ -40,7 +40,7 @@ pub struct Cell {
     pub ports: Vec<CellPort>,
     /// Links to the controller, by id, with names such as `modbus`.
     pub links: Vec<(LinkId, String)>,
-    /// The frames of its configuration, by name.
+    /// Decodes the frames of its configuration.
     pub decoder: Arc<Decoder>,
     /// The wall clock at an instant of the engine's clock.
     pub epoch: Epoch,
@@ -59,18 +59,18 @@ pub struct CellPort {
     pub bit_rate: u32,
 }
 
-/// The wall clock at an instant of the engine's clock. All times of a run are counted from it, so that a clock that
-/// is set meanwhile does not disturb their order.
+/// The wall clock at an instant of the engine's clock. All times of a run are relative to it, so setting the clock
+/// meanwhile does not change their order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Epoch {
     /// The instant.
     pub at: Instant,
-    /// What the wall clock shows then.
+    /// The wall clock at that instant.
     pub wall: SystemTime,
 }
 
 impl Epoch {
-    /// Nanoseconds since 1970 at this instant; microseconds are what is known.
+    /// Nanoseconds since 1970 at this instant, with a resolution of microseconds.
     pub fn unix_nanos(&self, at: Instant) -> u64 {
         let wall = self.wall.duration_since(UNIX_EPOCH).unwrap_or_default();
         let (now, then) = (at.as_micros(), self.at.as_micros());
@@ -84,7 +84,7 @@ impl Epoch {
 }
 
 impl Cell {
-    /// The ports and links of an engine with this configuration, whose frames `decoder` knows.
+    /// The ports and links of an engine with this configuration; `decoder` knows its frames.
     pub fn new<const P: usize, const U: usize, const F: usize, const T: usize, const E: usize>(
         config: &GatewayConfig,
         engine: &Engine<P, U, F, T, E>,

@@ -1,14 +1,14 @@
 //! Recordings of whole runs: MCAP files in a folder, within a budget.
 //!
-//! In: a subscription. Out: `RUN.PART.mcap` files. A run is one start of
-//! `host-sim gateway`, called after its time; its parts are files of limited size. Each has
+//! In: a subscription. Out: `RUN.PART.mcap` files. A run is one start of `host-sim gateway`, named after its time. Its
+//! parts are files of limited size. Each file has
 //!
 //! - a channel for the frames of each kind at each port, decoded to JSON with a schema: `/hand/input/502`
-//! - a channel for frames that were rejected or that the file does not have: `/hand/rejected`, `/hand/other`
+//! - a channel for frames that were rejected or that the file does not know: `/hand/rejected`, `/hand/other`
 //! - the channel [`ENGINE`] with every call of the engine, from which [`replay`](crate::replay) runs it again.
 //!
-//! Where the gateway gets another configuration, another part begins: the same channel may have other values then.
-//! The oldest parts go when the folder is full. A process that is killed loses the last second at most.
+//! A new configuration of the gateway begins a new part, because the same channel may have other values then. The
+//! oldest parts are removed when the folder is full. A killed process loses at most the last second.
 
 mod folder;
 mod part;
@@ -33,16 +33,16 @@ use part::RecordingPart;
 pub(crate) use folder::run_of;
 pub use folder::{Folder, run_name};
 
-/// The channel of the engine's calls: each message is one, as the entries of a recording (docs/cortex-m7.md section
-/// 1), with the calls counted in `sequence`.
+/// The channel of the engine's calls. Each message is one call, as entries of a recording (docs/cortex-m7.md section
+/// 1); `sequence` counts the calls.
 pub const ENGINE: &str = "/engine";
-/// The encoding of its messages.
+/// The encoding of the channel's messages.
 pub const ENGINE_ENCODING: &str = "application/x-recipe-gateway-record";
 
 /// Options of a recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RecordOptions {
-    /// The folder, which is made if it is not there.
+    /// The folder, which is created if it does not exist.
     pub folder: PathBuf,
     /// Maximum number of bytes of all recordings in the folder.
     pub budget: u64,
@@ -58,7 +58,7 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Begins to record what `watch` tells; call it before the gateway starts, so that its run can be replayed.
+    /// Starts to record the records of `watch`. Call it before the gateway starts, so its run can be replayed.
     pub fn start(watch: &Watch, options: RecordOptions) -> io::Result<Self> {
         let folder = Folder::open(&options.folder)?;
         let subscription = watch.subscribe(Interest { frames: true, passes: true }, ROOM);
@@ -82,7 +82,7 @@ impl Recording {
         Ok(Self { ended, failures })
     }
 
-    /// Number of times that it could not write.
+    /// Number of failed writes.
     pub fn failures(&self) -> u64 {
         self.failures.load(Relaxed)
     }
@@ -101,12 +101,12 @@ struct Recorder {
     run: Option<String>,
     part: Option<RecordingPart>,
     parts: u32,
-    /// Calls of the engine so far, those that were lost included.
+    /// Number of calls of the engine so far, including lost ones.
     passes: u32,
-    /// Records that were missed since the newest call of the engine.
+    /// Number of records missed since the newest call of the engine.
     missed: u64,
     is_failing: bool,
-    /// When a file is tried again after a failure.
+    /// When to retry after a failure.
     retry_at: Option<Deadline>,
 }
 
@@ -138,7 +138,7 @@ impl Recorder {
         }
     }
 
-    /// What is lost is seen at the gap in the numbers of the engine's calls.
+    /// Handles a failed write. Lost calls show as a gap in the numbers of the calls.
     fn failed(&mut self, error: &io::Error) {
         self.failures.fetch_add(1, Relaxed);
         self.part = None;
@@ -155,7 +155,7 @@ impl Recorder {
         if let What::Began(cell) = what {
             self.run.get_or_insert_with(|| run_name(cell.epoch.wall));
             self.cell = Some(Arc::clone(cell));
-            // A channel has one schema in a file.
+            // A channel has only one schema in a file.
             return self.part.take().map_or(Ok(()), RecordingPart::finish);
         }
         let sequence = match what {
@@ -186,7 +186,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Begins the next file if there is none; false while a failure is not yet over.
+    /// Begins the next file if there is none; false until a failure may be retried.
     fn has_part(&mut self) -> io::Result<bool> {
         if self.part.is_some() {
             return Ok(true);
@@ -208,7 +208,7 @@ impl Recorder {
 }
 
 fn write_frame(part: &mut RecordingPart, cell: &Cell, time: u64, frame: &Frame) -> io::Result<()> {
-    // What goes over links is in the calls of the engine.
+    // The calls of the engine include the traffic of links.
     let TapPlace::Port(port) = frame.place else { return Ok(()) };
     let Some(port) = cell.port(port) else { return Ok(()) };
     if frame.verdict == TapVerdict::Taken
@@ -235,7 +235,7 @@ fn write_frame(part: &mut RecordingPart, cell: &Cell, time: u64, frame: &Frame) 
     part.message(&name, "frame", &frame_schema(), time, &values)
 }
 
-/// Of frames that have no values.
+/// The schema of frames without values.
 fn frame_schema() -> Value {
     json!({ "type": "object", "title": "frame", "properties": {
         "direction": { "type": "string", "enum": ["in", "out"] },
@@ -250,14 +250,14 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(" ")
 }
 
-/// Records that may wait for the disk.
+/// Maximum number of records that wait for the disk.
 const ROOM: usize = 32_768;
-/// What a killed process loses at most.
+/// The longest time that a killed process loses.
 const FLUSH_INTERVAL: Duration = Duration::from_secs(1);
 const RETRY_INTERVAL: Duration = Duration::from_secs(5);
-/// What the end of a file may take: its last chunk, indexes and summary.
+/// Maximum size of the end of a file: its last chunk, indexes and summary.
 const MARGIN: u64 = 2 * part::CHUNK + (64 << 10);
-/// The smallest file that leaves room for content.
+/// Minimum size of a file with room for content.
 pub const MIN_FILE: u64 = 4 * MARGIN;
 /// How long the end of the program waits for the disk.
 const PATIENCE: Duration = Duration::from_secs(10);

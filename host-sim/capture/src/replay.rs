@@ -1,8 +1,9 @@
-//! A recorded run again, in virtual time: the same inputs to another engine, and its outputs compared byte for byte.
+//! Replays a recorded run in virtual time: another engine gets the same inputs, and its outputs are compared byte for
+//! byte.
 //!
-//! In: a recording ([`crate::recording`]), or the plain one of `proto_core::record`. Out: whether this program's
-//! engine decides the same, and the first place where it does not. An engine has to be run from its start: a
-//! recording whose first part was dropped cannot be replayed, and one with a gap only up to it.
+//! In: a recording ([`crate::recording`]), or a plain recording of `proto_core::record`. Out: whether this program's
+//! engine makes the same decisions, and the first difference. An engine has to be run from its start: a recording
+//! without its first part cannot be replayed, and a recording with a gap only up to the gap.
 
 use std::fmt;
 use std::fs::{self, File};
@@ -26,9 +27,9 @@ pub enum ReplayError {
     Io(PathBuf, io::Error),
     /// The folder has no recording.
     Empty(PathBuf),
-    /// It is no recording, or not one of this version.
+    /// The file is not a recording, or a recording of another version.
     NotARecording(PathBuf),
-    /// The beginning of the run is not there.
+    /// The beginning of the run is missing.
     NoStart(PathBuf),
     /// The configuration cannot be run by this program.
     Config(String),
@@ -59,51 +60,51 @@ impl std::error::Error for ReplayError {}
 /// The result of a replay.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Report {
-    /// Engines that began.
+    /// Number of started engines.
     pub starts: u64,
-    /// Inputs passed to them.
+    /// Number of inputs passed to the engines.
     pub inputs: u64,
-    /// Outputs that were compared.
+    /// Number of compared outputs.
     pub outputs: u64,
     /// The first and the last instant.
     pub span: Option<(Instant, Instant)>,
     /// Number of files.
     pub files: usize,
-    /// The recording ends within an entry or a chunk, as that of a killed process does.
+    /// Whether the recording ends within an entry or a chunk, as after a killed process.
     pub is_cut: bool,
-    /// What ended the replay before the end of the recording.
+    /// Why the replay ended before the recording.
     pub stopped: Option<Stopped>,
 }
 
-/// What ends a replay early.
+/// Why a replay ended early.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Stopped {
-    /// The engine did something else.
+    /// The engine behaved differently.
     Differs(Box<Difference>),
     /// Calls of the engine are missing.
     Gap {
-        /// The last instant before it.
+        /// The last instant before the gap.
         at: Option<Instant>,
-        /// Number of calls that are missing.
+        /// Number of missing calls.
         missing: u32,
     },
 }
 
-/// Where two engines differ.
+/// The first difference between two engines.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    /// When.
+    /// The time of the difference.
     pub at: Instant,
     /// The input, in words.
     pub input: String,
-    /// What the recorded engine did.
+    /// The outputs of the recorded engine.
     pub recorded: Vec<String>,
-    /// What this one does.
+    /// The outputs of the replayed engine.
     pub replayed: Vec<String>,
 }
 
-/// Replays a file, or the newest run of a folder. A file that is a part of a run stands for all of it. With
-/// `plain`, the recording is also written there without anything around it, as `proto_core::record::replay` takes it.
+/// Replays a file, or the newest run of a folder. A file that is part of a run stands for the whole run. With `plain`,
+/// the recording is also written there without its container, as `proto_core::record::replay` takes it.
 pub fn replay(path: &Path, plain: Option<&mut dyn Write>) -> Result<Report, ReplayError> {
     let io_error = |error| ReplayError::Io(path.to_owned(), error);
     let mut runner = Runner { plain, ..Runner::default() };
@@ -155,12 +156,12 @@ struct Runner<'p> {
     engine: Option<Box<Engine>>,
     report: Report,
     plain: Option<&'p mut dyn Write>,
-    /// There are calls of an engine whose start is not in the recording.
+    /// Whether there are calls of an engine whose start is missing.
     has_headless: bool,
 }
 
 impl Runner<'_> {
-    /// One file; false if the replay has stopped.
+    /// Replays one file; false if the replay has stopped.
     fn part(&mut self, path: &Path, sequence: &mut Option<u32>) -> Result<bool, ReplayError> {
         let file = File::open(path).map_err(|error| ReplayError::Io(path.to_owned(), error))?;
         let end = calls::each(file, &mut |number, bytes| {
@@ -196,7 +197,7 @@ impl Runner<'_> {
         self.plain.as_mut().map_or(Ok(()), |plain| plain.write_all(bytes)).map_err(ReplayError::Plain)
     }
 
-    /// Runs these entries: a whole recording, or one call of the engine.
+    /// Replays entries: a whole recording, or one call of the engine.
     fn entries(&mut self, bytes: &[u8]) -> Result<(), ReplayError> {
         let mut rest = bytes;
         while !rest.is_empty() && self.report.stopped.is_none() {
@@ -208,7 +209,7 @@ impl Runner<'_> {
             match entry {
                 Entry::Start { image } => self.start(image)?,
                 Entry::Input { at, input } => {
-                    // Of an engine whose start is not there.
+                    // A call of an engine whose start is missing.
                     let Some(engine) = &mut self.engine else {
                         self.has_headless = true;
                         continue;
@@ -246,7 +247,7 @@ impl Runner<'_> {
                     Some(engine) => engine.make_safe(),
                     None => self.has_headless = true,
                 },
-                // Those of a call are taken with it.
+                // Outputs are consumed together with their call.
                 Entry::Output(_) => {}
             }
         }
@@ -268,7 +269,7 @@ impl Runner<'_> {
     }
 }
 
-/// The outputs at the front of `rest`, which then begins behind them.
+/// Removes the outputs at the front of `rest` and returns them.
 fn outputs<'a>(rest: &mut &'a [u8]) -> &'a [u8] {
     let all = *rest;
     while let Some((Entry::Output(_), after)) = Entry::parse(rest) {
@@ -277,7 +278,7 @@ fn outputs<'a>(rest: &mut &'a [u8]) -> &'a [u8] {
     all.get(..all.len() - rest.len()).unwrap_or(all)
 }
 
-/// What an engine does for an input.
+/// The outputs of an engine for an input.
 fn pass(engine: &mut Engine, at: Instant, input: Input<'_>) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut buf = [0; OUTPUT_BUFFER];

@@ -1,8 +1,7 @@
-//! Who watches the gateway: any number of subscribers, each with its own bounded queue.
+//! Subscribers of a gateway's records, each with its own bounded queue.
 //!
-//! In: records, from the one thread that reads the gateway's ring. Out: the same records for each subscriber. A
-//! subscriber that does not take its records misses some, which is counted for it alone. Nothing waits for a
-//! subscriber.
+//! In: records, from the one thread that reads the gateway's ring. Out: the same records for each subscriber. A slow
+//! subscriber misses records, which are counted for it alone. Nothing waits for a subscriber.
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
@@ -14,12 +13,12 @@ use std::time::{Duration, Instant as Deadline};
 
 use crate::record::{Record, What};
 
-/// What a subscriber wants to have.
+/// The kinds of records that a subscriber wants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Interest {
     /// Frames at ports and links.
     pub frames: bool,
-    /// Every call of the engine. An engine can be run again only with those since its start, so subscribe before it.
+    /// Every call of the engine. A replay requires all calls since the engine's start, so subscribe before it.
     pub passes: bool,
 }
 
@@ -41,13 +40,13 @@ impl Interest {
     }
 }
 
-/// A gateway as it can be watched. Clones are of the same gateway; it may be started more than once.
+/// The records of a gateway, which may be started more than once. Clones share them.
 #[derive(Debug, Clone, Default)]
 pub struct Watch(Arc<WatchState>);
 
 #[derive(Debug, Default)]
 struct WatchState {
-    /// What any subscriber wants: the bits of [`Interest`].
+    /// The kinds that any subscriber wants, as bits of [`Interest`].
     wanted: AtomicU8,
     state: Mutex<Wanted>,
 }
@@ -55,7 +54,7 @@ struct WatchState {
 #[derive(Debug, Default)]
 struct Wanted {
     queues: Vec<Arc<Queue>>,
-    /// The newest [`What::Began`], for those who subscribe later.
+    /// The newest [`What::Began`], for later subscribers.
     began: Option<Arc<Record>>,
     /// The thread that reads the ring, woken by a new subscription.
     reader: Option<Thread>,
@@ -79,12 +78,12 @@ struct Inner {
     waker: Option<Waker>,
 }
 
-/// A record as a subscriber gets it.
+/// A record for one subscriber.
 #[derive(Debug, Clone)]
 pub struct Arrived {
     /// The record.
     pub record: Arc<Record>,
-    /// Number of records before it that this subscriber has missed.
+    /// Number of records that this subscriber has missed before it.
     pub missed: u64,
 }
 
@@ -93,9 +92,9 @@ pub struct Arrived {
 pub enum Next {
     /// A record.
     Record(Arrived),
-    /// Nothing has arrived in time.
+    /// Nothing arrived before the timeout.
     Nothing,
-    /// Nothing will arrive any more.
+    /// Nothing more will arrive.
     End,
 }
 
@@ -112,7 +111,7 @@ impl Watch {
         Self::default()
     }
 
-    /// Subscribes. At most `capacity` records wait to be taken, 1 at least; further ones are missed.
+    /// Subscribes. At most `capacity` records, and at least 1, wait to be taken; further records are missed.
     pub fn subscribe(&self, interest: Interest, capacity: usize) -> Subscription {
         let queue = Arc::new(Queue {
             interest,
@@ -136,7 +135,7 @@ impl Watch {
         Subscription { queue, shared: Arc::clone(&self.0) }
     }
 
-    /// What any subscriber wants. Costs one relaxed load.
+    /// The kinds of records that any subscriber wants. Costs one relaxed load.
     #[inline]
     pub fn wanted(&self) -> Interest {
         Interest::of_bits(self.0.wanted.load(Ordering::Relaxed))
@@ -159,7 +158,7 @@ impl Watch {
         }
     }
 
-    /// Nothing more will be given.
+    /// Ends all subscriptions after their waiting records.
     pub fn close(&self) {
         let mut state = locked(&self.0.state);
         state.is_closed = true;
@@ -234,7 +233,7 @@ impl Subscription {
         }
     }
 
-    /// The next record, for a task; `None` if nothing will arrive any more.
+    /// The next record, for an async task; `None` if nothing more will arrive.
     pub async fn arrived(&self) -> Option<Arrived> {
         poll_fn(|context| {
             let mut inner = locked(&self.queue.inner);
@@ -250,7 +249,7 @@ impl Subscription {
         .await
     }
 
-    /// Number of records that were missed since the newest one that arrived.
+    /// Number of records missed since the newest arrived record.
     pub fn missed(&self) -> u64 {
         locked(&self.queue.inner).missed
     }
@@ -264,7 +263,7 @@ impl Drop for Subscription {
     }
 }
 
-/// Nothing that holds these locks can panic half way.
+/// No code that holds these locks can panic half way.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,18 +1,18 @@
-//! The folder of recordings: which files are ours, and how much space they take.
+//! The folder of recordings: which files are recordings, and their size.
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// A folder of recordings. Other files in it are left alone.
+/// A folder of recordings. Other files in it are ignored.
 #[derive(Debug, Clone)]
 pub struct Folder {
     path: PathBuf,
 }
 
 impl Folder {
-    /// Makes the folder if it is not there.
+    /// Opens the folder, and creates it if it does not exist.
     pub fn open(path: &Path) -> io::Result<Self> {
         fs::create_dir_all(path)?;
         let folder = Self { path: path.to_owned() };
@@ -20,7 +20,7 @@ impl Folder {
         Ok(folder)
     }
 
-    /// The file of a part, from 1.
+    /// The path of a part, counted from 1.
     pub fn part(&self, run: &str, part: u32) -> PathBuf {
         self.path.join(format!("{run}.{part:04}.mcap"))
     }
@@ -41,7 +41,7 @@ impl Folder {
         Ok(parts.into_iter().map(|(_, path, len)| (path, len)).collect())
     }
 
-    /// Removes the oldest parts until all take at most so many bytes.
+    /// Removes the oldest parts until the others take at most this many bytes.
     pub fn make_room(&self, bytes: u64) -> io::Result<()> {
         let parts = self.parts()?;
         let mut used: u64 = parts.iter().map(|(_, len)| len).sum();
@@ -63,12 +63,12 @@ impl Folder {
     }
 }
 
-/// The run that a file is a part of, by its name.
+/// The run that a file belongs to, by its name.
 pub(crate) fn run_of(path: &Path) -> Option<String> {
     split(path.file_name()?.to_str()?).map(|(run, _)| run.to_owned())
 }
 
-/// Run and part of the name of a file of ours.
+/// Run and part in the name of a recording's file.
 fn split(name: &str) -> Option<(&str, u32)> {
     let (run, part) = name.strip_suffix(".mcap")?.rsplit_once('.')?;
     let is_run = run.len() == RUN_LEN && run.bytes().all(|byte| byte.is_ascii_digit() || byte == b'-');
@@ -76,10 +76,10 @@ fn split(name: &str) -> Option<(&str, u32)> {
     (is_run && is_part).then_some((run, part.parse().ok()?))
 }
 
-/// `20260102-030405-678`, UTC.
+/// Length of `20260102-030405-678`, UTC.
 const RUN_LEN: usize = 19;
 
-/// The name of a run that begins now.
+/// The name of a run that begins at `now`.
 pub fn run_name(now: SystemTime) -> String {
     let since = now.duration_since(UNIX_EPOCH).unwrap_or_default();
     let (days, second) = (since.as_secs() / 86_400, since.as_secs() % 86_400);
@@ -90,7 +90,7 @@ pub fn run_name(now: SystemTime) -> String {
 
 /// Year, month and day of a day since 1970, in the Gregorian calendar.
 fn civil(days: u64) -> (u64, u64, u64) {
-    // Counted from 1 March of the year 0, so that the day that comes and goes is a year's last.
+    // Counted from 1 March of the year 0, so the leap day is the last day of a year.
     let days = days + 719_468;
     let (era, day_of_era) = (days / 146_097, days % 146_097);
     let year = (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;

@@ -14,18 +14,18 @@ use serde_json::Value;
 
 use super::{ENGINE, ENGINE_ENCODING};
 
-/// Bytes of a chunk; one that is not whole is lost when the process is killed.
+/// Bytes of a chunk. A partial chunk is lost when the process is killed.
 pub(super) const CHUNK: u64 = 256 << 10;
 
-/// One file. It is readable up to the last [`RecordingPart::flush`] whatever happens.
+/// One file. Whatever happens, it is readable up to the last [`RecordingPart::flush`].
 pub(super) struct RecordingPart {
     writer: Writer<NoSeek<Counted>>,
-    /// Bytes that were written, and the file.
+    /// Number of written bytes.
     written: Arc<AtomicU64>,
     file: File,
     /// Bytes up to the last flush.
     whole: u64,
-    /// Bytes of messages since then.
+    /// Bytes of messages since the last flush.
     pending: u64,
     channels: BTreeMap<String, (u16, u32)>,
 }
@@ -52,7 +52,7 @@ impl RecordingPart {
         let file = File::create_new(path)?;
         let written = Arc::new(AtomicU64::new(0));
         let counted = Counted { file: file.try_clone()?, written: Arc::clone(&written) };
-        // A chunk is written in one piece, so that a killed process leaves no chunk without its length.
+        // A chunk is written as a whole, so a killed process leaves no chunk without its length.
         let options = WriteOptions::new()
             .compression(None)
             .profile("")
@@ -67,12 +67,12 @@ impl RecordingPart {
         Ok(Self { writer, written, file, whole, pending: 0, channels: BTreeMap::new() })
     }
 
-    /// Bytes of the file, with what was not flushed.
+    /// Bytes of the file, including bytes that were not flushed.
     pub(super) fn len(&self) -> u64 {
         self.whole.max(self.written.load(Relaxed)) + self.pending
     }
 
-    /// One call of the engine.
+    /// Writes one call of the engine.
     pub(super) fn engine(&mut self, time: u64, sequence: u32, bytes: &[u8]) -> io::Result<()> {
         let channel = match self.channels.get(ENGINE) {
             Some(&(channel, _)) => channel,
@@ -86,7 +86,7 @@ impl RecordingPart {
         self.write(channel, sequence, time, bytes)
     }
 
-    /// Values of a frame.
+    /// Writes the values of a frame.
     pub(super) fn message(
         &mut self,
         topic: &str,
@@ -125,7 +125,7 @@ impl RecordingPart {
         self.kept(result)
     }
 
-    /// Ends the chunk: what was written until now is readable.
+    /// Ends the chunk: everything written so far becomes readable.
     pub(super) fn flush(&mut self) -> io::Result<()> {
         if self.pending == 0 {
             return Ok(());
@@ -142,7 +142,7 @@ impl RecordingPart {
         self.file.sync_data()
     }
 
-    /// After a failure the file ends behind its last whole chunk.
+    /// After a failure, truncates the file to its last whole chunk.
     fn kept(&self, result: io::Result<()>) -> io::Result<()> {
         result.inspect_err(|_| {
             let _ = self.file.set_len(self.whole);
