@@ -1,8 +1,7 @@
 //! A CAN database (DBC) of the frames of a file's CAN ports.
 //!
-//! In: the frames of a file. Out: the text. Signals have the values that are on the bus, as `host-sim decode`
-//! shows them; what becomes of them is in the comments. Frames that share an id are multiplexed by the constants
-//! in which they differ.
+//! In: the frames of a file. Out: the text. Signals have the raw values on the bus, as `host-sim decode` shows them;
+//! comments say what they are used for. Frames that share an id are multiplexed by the constants in which they differ.
 
 mod multiplex;
 
@@ -25,19 +24,19 @@ use multiplex::Multiplex;
 pub struct Dbc {
     /// The file's text, ASCII.
     pub text: String,
-    /// What could not be said in it.
+    /// What a DBC cannot express.
     pub notes: Vec<String>,
 }
 
-/// Why there is no database.
+/// Why no database was made.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum DbcError {
-    /// No port is called so.
+    /// There is no port with this name.
     NoPort {
-        /// The name that was asked for.
+        /// The requested name.
         name: String,
-        /// The CAN ports that there are.
+        /// The names of the CAN ports.
         known: Vec<String>,
     },
     /// The file has no CAN port.
@@ -49,7 +48,7 @@ pub enum DbcError {
         /// The ports.
         ports: [String; 2],
     },
-    /// Two names become one.
+    /// Two names have the same identifier.
     Names(Collision),
 }
 
@@ -77,7 +76,7 @@ impl From<Collision> for DbcError {
     }
 }
 
-/// The database of all CAN ports, or of the one called `port`.
+/// The database of all CAN ports, or of the port called `port`.
 pub fn dbc(model: &Model, port: Option<&str>) -> Result<Dbc, DbcError> {
     let can = || model.ports.iter().filter(|port| matches!(port.bus, BusModel::Can { .. }));
     let known = || can().map(|port| port.name.clone()).collect::<Vec<_>>();
@@ -128,7 +127,7 @@ fn messages<'m>(
     Ok(messages)
 }
 
-/// An id as a DBC has it: bit 31 of those with 29 bits.
+/// An id in a DBC: bit 31 marks a 29-bit id.
 fn number(id: CanId) -> u32 {
     match id {
         CanId::Standard(id) => u32::from(id),
@@ -142,7 +141,7 @@ struct DbcWriter {
     nodes: Names,
     message_names: Names,
     messages: String,
-    /// Comments, attributes, names of values and the rest, each of which has its place in the file.
+    /// Comments, attributes, names of values and the rest, which have separate places in the file.
     comments: String,
     attributes: String,
     value_names: String,
@@ -157,7 +156,7 @@ struct SignalShape {
     bits: usize,
     order: ByteOrder,
     signed: bool,
-    /// As `SIG_VALTYPE_` has it: 0 integer, 1 float, 2 double.
+    /// As in `SIG_VALTYPE_`: 0 integer, 1 float, 2 double.
     value_type: u8,
 }
 
@@ -217,7 +216,7 @@ impl DbcWriter {
         Ok(())
     }
 
-    /// The signals of frames with one id: the constants that tell them apart, then those of each.
+    /// The signals of frames with one id: the multiplexing constants, then the signals of each frame.
     fn multiplexed(
         &mut self,
         scope: &mut Scope,
@@ -268,7 +267,7 @@ impl DbcWriter {
             let (mut name, mut tag, mut below) = (field.name().to_owned(), tag, below);
             match scope.in_several.get(field.name()) {
                 None => {}
-                // The same in every frame, so it is always there.
+                // The same in every frame, so always present.
                 Some(Several::Same) => {
                     if !scope.done.insert(name.clone()) {
                         continue;
@@ -276,7 +275,7 @@ impl DbcWriter {
                     (tag, below) = ("", None);
                 }
                 Some(Several::Different) => {
-                    // Roles may be the same, numbers are not.
+                    // Frames may have the same role, but not the same number.
                     let number = below.map_or(0, |(_, number)| number);
                     let above = skipped.get(1).and(below).map_or("", |(above, _)| above);
                     name = format!("{name}-{}-{above}{number}", format.role.name());
@@ -312,7 +311,7 @@ impl DbcWriter {
         }
     }
 
-    /// Comment and names of values.
+    /// Writes the comment and the names of values.
     fn describe(&mut self, id: u32, name: &str, field: &FrameField, element: &Element, half: &str) {
         let mut words = Vec::new();
         if name != field.name() {
@@ -356,18 +355,18 @@ struct Scope {
     id: u32,
     receiver: String,
     names: Names,
-    /// Names of fields that more than one of its frames has.
+    /// Names of fields that occur in several frames.
     in_several: BTreeMap<String, Several>,
-    /// Those of them that are there already.
+    /// The names in `in_several` that are already written.
     done: BTreeSet<String>,
 }
 
-/// A name that more than one frame of a message has.
+/// A field name that occurs in several frames of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Several {
-    /// All of them, at the same place.
+    /// In all frames, at the same place.
     Same,
-    /// Some of them, or at different places.
+    /// In some frames, or at different places.
     Different,
 }
 
@@ -384,7 +383,7 @@ fn in_several(formats: &[&Format]) -> BTreeMap<String, Several> {
     several.map(|(name, shapes)| (name, kind(&shapes))).collect()
 }
 
-/// How often a frame is sent.
+/// The period of a frame.
 fn period(format: &Format, port: &PortModel) -> Option<Duration> {
     use crate::model::Role;
     match format.role {
@@ -394,12 +393,12 @@ fn period(format: &Format, port: &PortModel) -> Option<Duration> {
     }
 }
 
-/// Where the bits of a field are; `None` if that is not the same in all frames.
+/// The place of a field's bits; `None` if it is not the same in all frames.
 fn shape(field: &FrameField, element: &Element) -> Option<SignalShape> {
     let (at, len) = (field.place.at?, field.place.len?);
     let whole = SignalShape { start: 0, bits: 8 * len, order: ByteOrder::Big, signed: false, value_type: 0 };
     let Some(encoding) = element.encoding() else {
-        // Characters, the first is the highest byte.
+        // Characters: the first one is the highest byte.
         return Some(SignalShape { start: 8 * at + 7, ..whole }).filter(|shape| shape.bits <= 64);
     };
     let order = if len == 1 { ByteOrder::Little } else { encoding.order };
@@ -416,7 +415,7 @@ fn shape(field: &FrameField, element: &Element) -> Option<SignalShape> {
     };
     let start = match order {
         ByteOrder::Big => {
-            // The highest bit; the last byte is the lowest.
+            // The highest bit, if the last byte is the lowest.
             let highest = first + bits - 1;
             8 * (at + len - 1).checked_sub(highest / 8)? + highest % 8
         }
@@ -425,7 +424,7 @@ fn shape(field: &FrameField, element: &Element) -> Option<SignalShape> {
     Some(SignalShape { start, bits, order, signed, value_type })
 }
 
-/// A number whose words are swapped as two signals, which a DBC can say; anything else as it is.
+/// A number with swapped words becomes two signals, because a DBC cannot express it as one; others stay as they are.
 fn halves(shape: SignalShape) -> Vec<(&'static str, SignalShape)> {
     if !shape.order.swaps_words() {
         return vec![("", shape)];
@@ -441,7 +440,7 @@ fn halves(shape: SignalShape) -> Vec<(&'static str, SignalShape)> {
     names.into_iter().zip(0..words).map(|(name, word)| (name, half(word, order))).collect()
 }
 
-/// What a signal cannot say of how its field is written.
+/// Properties of a field's encoding that a signal cannot express.
 fn encoding_words(element: &Element) -> Option<&'static str> {
     match element {
         Element::Text(_) => Some("characters, the first is the highest byte"),
@@ -455,7 +454,7 @@ fn encoding_words(element: &Element) -> Option<&'static str> {
     }
 }
 
-/// A text between quotes. Other characters than ASCII have no encoding that every tool reads.
+/// A quoted text. Characters other than ASCII have no encoding that every tool reads.
 fn quoted(text: &str) -> String {
     let plain = |c: char| match c {
         '"' => "'".to_owned(),

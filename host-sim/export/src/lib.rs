@@ -1,8 +1,8 @@
-//! What other tools need to read the frames of a gateway or controller file.
+//! Exports for other tools that read the frames of a gateway or controller file.
 //!
-//! In: a file ([`Model`]). Out: a CAN database ([`dbc`](dbc::dbc)), a dissector for Wireshark ([`lua`](lua::lua)),
-//! a map of who writes which variable ([`map`]). Names of files allow more than those tools do; [`names`] says
-//! what they become. Nothing here opens a device or a socket.
+//! In: a file ([`Model`]). Out: a CAN database ([`dbc`](dbc::dbc)), a dissector for Wireshark ([`lua`](lua::lua)), a
+//! map of the writers of variables ([`map`]). Names in files allow more characters than those tools; [`names`] converts
+//! them. Does not know devices or sockets.
 
 #![forbid(unsafe_code)]
 

@@ -1,8 +1,8 @@
 //! A dissector for Wireshark and tshark, in Lua.
 //!
-//! In: the frames of a file. Out: the text of a plugin that shows the frames of a capture by their names: those
-//! of serial ports in captures of `host-sim gateway --capture`, where the interface has the port's name, and CAN
-//! frames in any capture. Without such a name, every frame of the file is tried.
+//! In: the frames of a file. Out: the text of a plugin that shows the frames of a capture by name: frames of serial
+//! ports in captures of `host-sim gateway --capture`, where the interface has the port's name, and CAN frames in any
+//! capture. Without an interface name, every frame of the file is tried.
 
 use std::collections::BTreeMap;
 
@@ -68,7 +68,7 @@ pub fn lua(model: &Model) -> Result<String, Collision> {
 struct LuaWriter {
     proto_fields: String,
     proto_count: usize,
-    /// What each abbreviation is, and its index.
+    /// The definition of each abbreviation, and its index.
     known: BTreeMap<String, (String, usize)>,
     formats: String,
     count: usize,
@@ -206,7 +206,7 @@ fn width_of(element: &Element) -> Wide {
     }
 }
 
-/// The number of bytes of these fields, which do not vary behind a text that takes the rest.
+/// The length in bytes of these fields, which is constant after a text that takes the rest.
 fn behind(fields: &[FrameField]) -> usize {
     let is_shared = |field: &&FrameField| {
         field
@@ -219,7 +219,7 @@ fn behind(fields: &[FrameField]) -> usize {
     fields.iter().filter(|field| !is_shared(field)).map(|field| field.place.len.unwrap_or(0)).sum()
 }
 
-/// What the plugin calls the kind of a field, and its type in Wireshark.
+/// The plugin's name for the kind of a field, and the type in Wireshark.
 fn kind_of(element: &Element) -> (&'static str, &'static str) {
     let Some(encoding) = element.encoding() else {
         return match element {

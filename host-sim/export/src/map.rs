@@ -1,4 +1,4 @@
-//! Who writes which variable: a table for the person who enters it elsewhere.
+//! The writers of variables: a table for a person who configures other tools.
 //!
 //! In: the frames of a file. Out: one row for each use of a variable, or for each field without one, as Markdown
 //! or CSV: the variable with its place in the controller's Modbus map, the port, the frame, and where in the frame
@@ -12,7 +12,7 @@ use proto_core::wire::can::CanId;
 use crate::model::{Format, FrameField, Model, Owner, PortModel};
 use crate::uses::{describe_use, unit_of};
 
-/// How the table is written.
+/// The format of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Style {
     /// A table of Markdown.
@@ -51,7 +51,7 @@ pub fn map(model: &Model, style: Style) -> String {
             rows.push((var.ordinal(), row));
         }
     }
-    // In the order of the variables, then of the file.
+    // Sorted by variable, then in file order.
     rows.sort_by_key(|(ordinal, _)| *ordinal);
     let rows = rows.iter().map(|(_, row)| row);
     match style {
@@ -85,7 +85,7 @@ fn add_field(
     let rest = [&writer[..], &port.name, recipe, &frame, &place, &named, &uses];
     let mut variables: Vec<SysVar> = field.field.spec.variables().collect();
     variables.extend(field.system);
-    // What is always the same is for nobody to enter.
+    // Nobody has to enter a constant.
     if variables.is_empty() && field.constant().is_none() {
         rows.push((usize::MAX, row(None, rest)));
     }
@@ -94,7 +94,7 @@ fn add_field(
     }
 }
 
-/// Who writes the value: what the owner of the file receives comes from its devices.
+/// The writer of the value: what the owner of the file receives comes from its devices.
 fn writer(owner: Owner, direction: Direction) -> String {
     match (owner, direction) {
         (Owner::Gateway, Direction::Input) => "field",

@@ -1,7 +1,7 @@
-//! The frames of a file, all in one form: parts and exchanges, of devices and of the controller's own recipes.
+//! The frames of a file in one common form: parts and exchanges, of devices and of the controller's own recipes.
 //!
-//! In: a gateway file or a controller file. Out: ports, and for each recipe its frames with names, places and
-//! uses of their fields. What the exports write and what a recording decodes is made from this.
+//! In: a gateway file or a controller file. Out: ports, and for each recipe its frames with names, places and uses of
+//! their fields. Exports and decoded recordings are made from this.
 
 use std::path::Path;
 
@@ -46,12 +46,12 @@ pub struct PortModel {
     pub bus: BusModel,
     /// Index of its recipe; `None` if it is idle.
     pub recipe: Option<usize>,
-    /// How often the output part is sent, if time alone tells when.
+    /// The period of the output part, if it is only sent periodically.
     pub period: Option<Duration>,
-    /// The variables that tell the robot the port's health, with what each gets.
+    /// The values of the port's health that are written to variables, with the variables.
     pub health: Vec<(&'static str, SysVar)>,
-    /// What inputs become while the device is silent: the variable or bit as the file names it, the variable,
-    /// the value.
+    /// Safe values of inputs while the device is silent: the name of variable or bit in the file, the variable, the
+    /// value.
     pub safe: Vec<(String, SysVar, String)>,
 }
 
@@ -68,7 +68,7 @@ pub enum BusModel {
         /// Bit/s.
         bitrate: u32,
     },
-    /// A connection of Modbus TCP to devices: each frame has its header, and no CRC.
+    /// A Modbus TCP connection to devices: each frame has the header of Modbus TCP and no CRC.
     ModbusTcp,
     /// TCP or UDP.
     Network,
@@ -79,11 +79,11 @@ pub enum BusModel {
 pub struct Recipe {
     /// Its name.
     pub name: String,
-    /// Every frame: those of the input part, of the output part, of the exchanges.
+    /// Every frame: of the input part, of the output part, of the exchanges.
     pub formats: Vec<Format>,
 }
 
-/// What a frame is for.
+/// The purpose of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Role {
     /// The input part: user to robot.
@@ -92,11 +92,11 @@ pub enum Role {
     Output,
     /// The request of the exchange with this number, from 1.
     Request(usize),
-    /// Its reply.
+    /// The reply of this exchange.
     Reply(usize),
-    /// What the one who is asked sends while it is at it.
+    /// The frame of a peer that is still executing the request.
     Pending(usize),
-    /// What the one who is asked sends if it refuses the request.
+    /// The frame of a peer that refuses the request.
     Refusal(usize),
 }
 
@@ -114,7 +114,7 @@ impl Role {
     }
 }
 
-/// One frame: all frames with the same bytes at the same places.
+/// The format of all frames with the same fields at the same places.
 #[derive(Debug, Clone)]
 pub struct Format {
     /// What it is for.
@@ -123,11 +123,11 @@ pub struct Format {
     pub direction: Direction,
     /// Its id on CAN.
     pub id: Option<CanId>,
-    /// What tells the frames of a stream apart.
+    /// How the frames of a stream are separated.
     pub ends: FrameEnds,
-    /// How often it is sent, if it has a period of its own.
+    /// The period of the frame, if it has its own.
     pub every: Option<Duration>,
-    /// It is a remote frame, without data.
+    /// Whether it is a remote frame, without data.
     pub is_remote: bool,
     /// Bytes at the beginning and at the end.
     pub delimiters: (Vec<u8>, Vec<u8>),
@@ -140,23 +140,23 @@ pub struct Format {
 /// A field of a frame.
 #[derive(Debug, Clone)]
 pub struct FrameField {
-    /// As the file has it.
+    /// The field as in the file.
     pub field: DeviceField,
-    /// The system variable that a field of a realtime recipe is.
+    /// The system variable of a field of a realtime recipe.
     pub system: Option<SysVar>,
-    /// Where it is.
+    /// The place in the frame.
     pub place: Place,
-    /// Its index among the elements of the layout; `None` for a checksum.
+    /// Index among the elements of the layout; `None` for a checksum.
     pub element: Option<usize>,
 }
 
 impl FrameField {
-    /// Its name, empty for what needs none.
+    /// The field's name, empty if it needs none.
     pub fn name(&self) -> &str {
         &self.field.name
     }
 
-    /// The integer that it always is: those of the frame, and those that the gateway always sends.
+    /// The constant value of the field, if it is a constant of the frame or one that the gateway sends.
     pub fn constant(&self) -> Option<i64> {
         use proto_core::config::OutputBinding::Constant;
         match self.field.spec {
@@ -176,12 +176,12 @@ impl Model {
         file::with_text(path, |text| Self::parse(text, overrides))
     }
 
-    /// Same as [`Model::load`], from a text.
+    /// As [`Model::load`], from a text.
     pub fn parse(text: Text<'_>, overrides: &[String]) -> Result<Self, FileError> {
         let config = file::parse(text, overrides)?;
         let recipes = file::parse_recipes(text, overrides)?;
         let frames = file::parse_frames(text, overrides)?;
-        // Reading the file has laid out the same frames.
+        // The same frames were laid out when the file was read.
         let all = recipes.iter().zip(&frames).enumerate().map(|(nth, (recipe, framed))| {
             let gateway = match &config {
                 Config::Gateway(config) => config.recipes.get(nth).map(|recipe| (&**config, recipe)),
@@ -209,7 +209,7 @@ impl Model {
 }
 
 impl Format {
-    /// Whether a frame on the wire is one of these: its bytes without escapes. On CAN `id` is its id.
+    /// The bytes without escapes of a frame on the wire, if it has this format. `id` is its id on CAN.
     pub fn take(&self, id: Option<CanId>, bytes: &[u8]) -> Option<Vec<u8>> {
         if self.id != id || self.is_remote {
             return None;
@@ -218,7 +218,7 @@ impl Format {
         if layout.probe_whole(elements, bytes) == Probe::Frame(bytes.len()) {
             return Some(bytes.to_vec());
         }
-        // What is sent has its escape bytes.
+        // Sent frames include their escape bytes.
         let mut cutter = Cutter::new(self.ends.boundary, self.ends.escape)?;
         let mut chunk = bytes;
         while let Some(piece) = cutter.next_piece(&mut chunk, layout.tail()) {
@@ -253,7 +253,7 @@ fn gateway_ports(config: &GatewayConfig) -> Vec<PortModel> {
     config.ports.iter().map(port).collect()
 }
 
-/// A safe value as the file has it: of the whole variable, or of each of its bits.
+/// A safe value as in the file: for the whole variable, or for each of its bits.
 fn safe_value(safe: &SafeValue) -> Vec<(String, SysVar, String)> {
     let SafeValue { var, value, mask } = *safe;
     if safe.is_whole() {
@@ -350,7 +350,7 @@ fn of_system(recipe: &SimRecipe) -> Result<Vec<Format>, LayoutError> {
             for (part, stream) in [(Direction::Input, input), (Direction::Output, output)] {
                 let Some(stream) = stream else { continue };
                 let frame = named(None, (&stream.head, &stream.tail), &stream.fields);
-                // A datagram may have neither head nor tail.
+                // A datagram may have no head and no tail.
                 let is_bare = stream.head.is_empty() && stream.tail.is_empty();
                 let carrier = if is_bare { Carrier::Whole } else { Carrier::Stream };
                 add(part, carrier, &frame, &stream.fields)?;
@@ -378,7 +378,7 @@ impl Format {
     ) -> Result<Self, LayoutError> {
         let is_bare = frame.head.is_empty() && frame.tail.is_empty();
         let carrier = match carrier {
-            // Of a recipe for datagrams.
+            // A recipe for datagrams.
             Carrier::Stream if is_bare && ends == FrameEnds::default() => Carrier::Whole,
             Carrier::Stream if ends.boundary != Boundary::Fields || ends.escape.is_some() => Carrier::Whole,
             other => other,
@@ -409,7 +409,7 @@ impl Format {
         })
     }
 
-    /// The fields that have a value and a name, each once, with the element that has it.
+    /// The fields that have a value and a name, each once, with its element.
     pub fn named_values(&self) -> impl Iterator<Item = (&FrameField, &Element)> {
         self.fields.iter().filter(|field| !field.field.repeats && !field.name().is_empty()).filter_map(
             |field| {

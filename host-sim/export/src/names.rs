@@ -1,7 +1,7 @@
-//! Names for tools that allow less than a file does: identifiers of C with at most 32 characters.
+//! Names for tools that allow fewer characters than a file: C identifiers of at most 32 characters.
 //!
-//! In: the name of a recipe, port, field or variable, any UTF-8. Out: an identifier, always the same for the
-//! same name, and as readable as it can be:
+//! In: the name of a recipe, port, field or variable, any UTF-8. Out: an identifier, always the same for the same name,
+//! and as readable as possible:
 //!
 //! | in the name | in the identifier | example |
 //! |---|---|---|
@@ -11,14 +11,14 @@
 //! | a number in brackets | `_`, the number, `_` | `RobotState[8]`: `RobotState_8_` |
 //! | any other character, a digit at the beginning, and a `_` that would be read as one of these | `_x`, its code point in hexadecimal, `_` | `3d`: `_x33_d` |
 //!
-//! [`unmangle`] returns the name, so two names never become one. What would be longer than 32 characters
-//! is cut after 22 at most and ends with `_h` and eight hexadecimal digits, a hash of the whole name. Only
-//! then can two names meet, which [`Names`] finds.
+//! [`unmangle`] returns the name, so two names never have the same identifier. A longer identifier than 32 characters
+//! is cut after 22 at most and ends with `_h` and eight hexadecimal digits, a hash of the whole name. Only these can
+//! collide, which [`Names`] finds.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
-/// Maximum number of characters of an identifier, that of DBC.
+/// Maximum number of characters of an identifier, from DBC.
 pub const MAX_IDENTIFIER: usize = 32;
 
 /// The identifier of a name.
@@ -27,14 +27,13 @@ pub fn mangle(name: &str) -> String {
     whole(&tokens).unwrap_or_else(|| shortened(name, &tokens))
 }
 
-/// The identifier of a name that need not be cut.
+/// The identifier of a name, if it need not be cut.
 fn whole(tokens: &[String]) -> Option<String> {
     let identifier = if tokens.is_empty() { "_".to_owned() } else { tokens.concat() };
     (identifier.len() <= MAX_IDENTIFIER).then_some(identifier)
 }
 
-/// The identifier of a name that is too long. If the hash and what is before it would be read as a name, that
-/// is cut further.
+/// The identifier of a name that is too long. If the result could be unmangled to another name, it is cut further.
 fn shortened(name: &str, tokens: &[String]) -> String {
     let hash = format!("_h{:08x}", hash(name));
     let mut kept = 0;
@@ -47,11 +46,11 @@ fn shortened(name: &str, tokens: &[String]) -> String {
         kept += 1;
     }
     let mut candidates = (0..=kept).rev().map(|kept| tokens[..kept].concat() + &hash);
-    // The hash alone is never read as a name: no name begins with `_`.
+    // The hash alone cannot be unmangled: no name begins with `_`.
     candidates.find(|identifier| unmangle(identifier).is_none()).unwrap_or_else(|| hash.clone())
 }
 
-/// The name of an identifier; `None` if it has a hash, or if it is the identifier of no name.
+/// The name of an identifier; `None` if the identifier has a hash or belongs to no name.
 pub fn unmangle(identifier: &str) -> Option<String> {
     if identifier == "_" {
         return Some(String::new());
@@ -76,14 +75,14 @@ pub fn unmangle(identifier: &str) -> Option<String> {
     (whole(&tokens(&name)).as_deref() == Some(identifier)).then_some(name)
 }
 
-/// The identifiers of one scope, such as the signals of a message, in which each may be there only once.
+/// The identifiers of one scope, such as the signals of a message, which must be unique.
 #[derive(Debug, Clone, Default)]
 pub struct Names {
     by_identifier: BTreeMap<String, String>,
 }
 
 impl Names {
-    /// The identifier of `name`, which may be asked for more than once.
+    /// The identifier of `name`, which may be added more than once.
     ///
     /// # Errors
     /// [`Collision`] if another name of the scope has it.
@@ -91,10 +90,10 @@ impl Names {
         self.add_as(name, mangle(name))
     }
 
-    /// The identifier of a name that must not be there yet.
+    /// The identifier of a name that must be new.
     ///
     /// # Errors
-    /// [`Collision`] with another name or with itself.
+    /// [`Collision`] with another name or with the same name.
     pub fn add_new(&mut self, name: &str) -> Result<String, Collision> {
         let identifier = mangle(name);
         match self.by_identifier.get(&identifier) {
@@ -142,10 +141,10 @@ impl fmt::Display for Collision {
 
 impl std::error::Error for Collision {}
 
-/// `_h` and eight digits.
+/// Length of `_h` and eight digits.
 const HASH_LEN: usize = 10;
 
-/// Words that a DBC file takes for something else.
+/// Keywords of DBC.
 const KEYWORDS: [&str; 1] = ["VERSION"];
 
 /// The identifier in pieces that must not be cut.
@@ -184,9 +183,9 @@ fn escaped(c: char) -> String {
     format!("_x{:x}_", u32::from(c))
 }
 
-/// Whether a `_` copied from a name would be read as the beginning of something else. What follows it in
-/// the identifier begins as what follows it in the name does, up to the next character that is not plain,
-/// which becomes something that begins with `_`.
+/// Whether a `_` copied from a name would be read as the beginning of something else. Its successor in the identifier
+/// begins like its successor in the name, up to the next character that is not plain, which becomes something that
+/// begins with `_`.
 fn is_read_as_another(rest: &str) -> bool {
     let plain: String = rest[1..].chars().take_while(char::is_ascii_alphanumeric).collect();
     let ends = rest.len() == plain.len() + 1;
@@ -195,19 +194,19 @@ fn is_read_as_another(rest: &str) -> bool {
     number_at(&seen).is_some() || code_at(&seen).is_some() || is_hash
 }
 
-/// The number of a `[number]` that `text` begins with.
+/// The number in a `[number]` at the beginning of `text`.
 fn index_at(text: &str) -> Option<&str> {
     let (index, _) = text.strip_prefix('[')?.split_once(']')?;
     (!index.is_empty() && index.bytes().all(|byte| byte.is_ascii_digit())).then_some(index)
 }
 
-/// The length of a `_number_` that `text` begins with.
+/// The length of a `_number_` at the beginning of `text`.
 fn number_at(text: &str) -> Option<usize> {
     let (number, _) = text.strip_prefix('_')?.split_once('_')?;
     (!number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit())).then_some(number.len() + 2)
 }
 
-/// The length of a `_xcode_` that `text` begins with.
+/// The length of a `_xcode_` at the beginning of `text`.
 fn code_at(text: &str) -> Option<usize> {
     let (code, _) = text.strip_prefix("_x")?.split_once('_')?;
     (!code.is_empty() && is_hex(code)).then_some(code.len() + 3)

@@ -1,11 +1,11 @@
-//! What a field of a frame is for, in words: where its value goes, or where it comes from.
+//! Describes the use of a frame's field: where its value goes, or where it comes from.
 
 use proto_core::config::{FieldSpec, InputBinding, OutputBinding};
 use proto_core::sysvar::SysVar;
 
 use crate::model::FrameField;
 
-/// What becomes of a field's value, or what it shows; empty if nothing does.
+/// The use of a field's value, or its source; empty if there is none.
 pub fn describe_use(field: &FrameField) -> String {
     let spec = &field.field.spec;
     if let Some(var) = field.system {
@@ -57,7 +57,7 @@ pub fn describe_use(field: &FrameField) -> String {
     }
 }
 
-/// ` = value * 0.1 + 5`; empty if nothing is to be done.
+/// ` = value * 0.1 + 5`; empty for the identity.
 fn formula(scale: f32, offset: f32) -> String {
     if scale == 1.0 && offset == 0.0 {
         return String::new();
@@ -71,8 +71,7 @@ fn formula(scale: f32, offset: f32) -> String {
     format!(" = value{times}{plus}")
 }
 
-/// The unit of a variable. Rows of poses and forces in the table have two units: for X, Y, Z and for the
-/// rotations.
+/// The unit of a variable. Poses and forces have two units in the table: one for X, Y, Z and one for the rotations.
 pub fn unit_of(var: SysVar) -> &'static str {
     match var.unit().split_once(", ") {
         None => var.unit(),

@@ -1,4 +1,4 @@
-//! Which constants tell the frames of one id apart.
+//! Finds the constants that distinguish frames with the same id.
 
 use std::collections::BTreeSet;
 
@@ -7,7 +7,7 @@ use proto_core::device::Element;
 use super::{SignalShape, shape};
 use crate::model::Format;
 
-/// The constant that tells frames apart, or two of them together.
+/// One constant that distinguishes frames, or two constants together.
 #[derive(Debug, Clone)]
 pub(super) struct Multiplex {
     pub(super) first: MultiplexKey,
@@ -15,7 +15,7 @@ pub(super) struct Multiplex {
     first_values: Vec<u64>,
 }
 
-/// A constant that all the frames have at the same place.
+/// A constant that all frames have at the same place.
 #[derive(Debug, Clone)]
 pub(super) struct MultiplexKey {
     pub(super) name: String,
@@ -23,7 +23,7 @@ pub(super) struct MultiplexKey {
 }
 
 impl Multiplex {
-    /// What tells these frames apart; `None` if it is only one, or nothing does.
+    /// What distinguishes these frames; `None` for a single frame, or if nothing does.
     pub(super) fn of(formats: &[&Format]) -> Option<Self> {
         let (first_format, others) = formats.split_first().filter(|(_, others)| !others.is_empty())?;
         let everywhere =
@@ -54,7 +54,7 @@ impl Multiplex {
         Some(Self { first, second, first_values: values.into_iter().collect() })
     }
 
-    /// The values of the first constant, each once.
+    /// The distinct values of the first constant.
     pub(super) fn values(&self) -> impl Iterator<Item = u64> {
         self.first_values.iter().copied()
     }
@@ -68,7 +68,7 @@ impl Multiplex {
     }
 }
 
-/// The integers that are the same in every such frame.
+/// The integers that are the same in every frame of this format.
 fn constants(format: &Format) -> impl Iterator<Item = (MultiplexKey, u64)> {
     format.fields.iter().filter_map(|field| {
         let element = format.frame.elements.get(field.element?)?;
@@ -81,7 +81,7 @@ fn constants(format: &Format) -> impl Iterator<Item = (MultiplexKey, u64)> {
             "" => format!("constant-{}", shape.start),
             name => name.to_owned(),
         };
-        // Of a negative number its bits.
+        // The bits of a negative number.
         let mask = u64::MAX >> 64_usize.saturating_sub(shape.bits).min(63);
         Some((
             MultiplexKey { name, shape: SignalShape { signed: false, ..shape } },
