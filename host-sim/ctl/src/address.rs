@@ -1,6 +1,6 @@
-//! Where a gateway is: `--to ADDRESS[:PORT]`.
+//! The address of a gateway: `--to ADDRESS[:PORT]`.
 //!
-//! Without a port it is the one that a board has, 80; on this machine, where no board is, 8480.
+//! The default port is that of a board, 80. On this machine, where no board is, it is 8480.
 
 use std::fmt;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
@@ -8,10 +8,10 @@ use std::str::FromStr;
 
 /// The port of a board.
 const BOARD: u16 = 80;
-/// The port of a gateway on this machine, as the examples have it.
+/// The port of a gateway on this machine, as in the examples.
 const HERE: u16 = 8480;
 
-/// A place as a person writes it.
+/// An address as given by a person.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Address {
     host: String,
@@ -67,10 +67,10 @@ impl fmt::Display for Address {
 }
 
 impl Address {
-    /// The addresses of this name, with the port.
+    /// The socket addresses of this address.
     ///
     /// # Errors
-    /// The system's words, if the name is not known.
+    /// The system's message, if the name cannot be resolved.
     pub fn resolve(&self) -> Result<Vec<SocketAddr>, String> {
         let found = (self.host.as_str(), self.port.unwrap_or(BOARD)).to_socket_addrs();
         let found: Vec<_> = found.map_err(|error| error.to_string())?.collect();
@@ -86,7 +86,7 @@ impl Address {
         Ok(found.into_iter().map(place).collect())
     }
 
-    /// What may help if nobody is there.
+    /// A hint for an unreachable gateway.
     pub(crate) fn hint(&self, place: SocketAddr) -> &'static str {
         match self.port {
             None if place.port() == HERE => "; without a port it is 8480 on this machine",

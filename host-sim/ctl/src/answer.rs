@@ -1,4 +1,4 @@
-//! What a command found: as a document, as text, and as one row among those of other gateways.
+//! The result of a command: as a document, as text, and as one row in a table of several gateways.
 
 use serde_json::Value;
 
@@ -10,14 +10,14 @@ use crate::table::{TableCell, TableView};
 pub struct Answer {
     pub(crate) document: Value,
     pub(crate) text: AnswerText,
-    /// What a table of several gateways shows of it: headings and cells.
+    /// The row in a table of several gateways: headings and cells.
     pub(crate) row: Vec<(&'static str, TableCell)>,
     pub(crate) verdict: Verdict,
 }
 
 #[derive(Debug, Clone)]
 pub(crate) enum AnswerText {
-    /// Made by this program.
+    /// Text of this program.
     Made(String),
     /// A document of the gateway that is text itself, such as a configuration.
     Document(String),
@@ -38,17 +38,17 @@ impl Answer {
         Self { verdict: if is_well { Verdict::Well } else { Verdict::Trouble }, ..self }
     }
 
-    /// What the exit code says.
+    /// The verdict, which determines the exit code.
     pub fn verdict(&self) -> Verdict {
         self.verdict
     }
 
-    /// As a document, on one line.
+    /// The result as a document on one line.
     pub fn json(&self) -> String {
         crate::shown::json(&self.document) + "\n"
     }
 
-    /// As text. A document of the gateway goes to a file or pipe as it is.
+    /// The result as text. A document of the gateway goes to a file or pipe unchanged.
     pub fn text(&self, view: TableView) -> String {
         match &self.text {
             AnswerText::Made(text) => text.clone(),

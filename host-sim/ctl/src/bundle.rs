@@ -1,6 +1,6 @@
-//! `bundle`: everything that somebody who helps wants to see, in one document.
+//! `bundle`: all readable documents in one, for support.
 //!
-//! A host's gateway has it ready; of a board it is put together here. There is no secret in it.
+//! A gateway on a host has it ready; for a board it is put together here. It contains no secret.
 
 use std::time::Duration;
 
@@ -13,12 +13,12 @@ use crate::doctor::doctor;
 use crate::failure::Failure;
 use crate::reading::{log, metrics};
 
-/// The document. What a gateway does not tell is left out, and `missing` says why.
+/// The document. It omits what the gateway does not provide; `missing` says why.
 pub fn bundle(client: &Client) -> Result<Value, Failure> {
     if let Some(document) = client.json_if_there("bundle")? {
         return Ok(document);
     }
-    // If it does not even say who it is, there is nothing to put together.
+    // Without `info`, a bundle is useless.
     let mut bundle = Map::new();
     bundle.insert("info".into(), client.json("info")?);
     let mut missing = Map::new();
@@ -49,7 +49,7 @@ pub fn bundle(client: &Client) -> Result<Value, Failure> {
     Ok(bundle.into())
 }
 
-/// What became of a bundle that was written.
+/// The result for a written bundle.
 pub fn bundled(document: &Value, file: &str, len: usize) -> Answer {
     let missing: Vec<_> = document["missing"].as_object().into_iter().flatten().collect();
     let mut text = format!("{file}: {len} bytes\n");
@@ -61,5 +61,5 @@ pub fn bundled(document: &Value, file: &str, len: usize) -> Answer {
 
 type Get<'a> = &'a dyn Fn() -> Result<Value, Failure>;
 
-/// How long a board is listened to.
+/// How long to listen to a board.
 const LISTEN: Duration = Duration::from_secs(6);

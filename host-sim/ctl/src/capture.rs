@@ -1,6 +1,6 @@
 //! `capture`: frames as a file for Wireshark.
 //!
-//! A host's gateway sends the capture itself. For a board it is made here, of the frames in its stream.
+//! A gateway on a host sends the capture itself. For a board it is made here from the frames in its stream.
 
 use std::fs::File;
 use std::io::Write;
@@ -21,11 +21,11 @@ use crate::failure::Failure;
 use crate::frames::FramesDocument;
 use crate::trace::{has_port, is_plain, path};
 
-/// Writes what is seen at one port or at all to a file, until Ctrl-C or for some time. A capture that is there is
-/// replaced, no other file.
+/// Writes the traffic of one port or of all ports to a file, until Ctrl-C or for some time. Replaces an existing
+/// capture, but no other file.
 ///
 /// # Errors
-/// If it is refused, not reached, the stream ends, or the file cannot be written.
+/// If the request is refused, the gateway is not reached, the stream ends, or the file cannot be written.
 pub fn capture(
     client: &Client,
     file: &Path,
@@ -38,7 +38,7 @@ pub fn capture(
     let stop = time.map_or_else(|| client.stop().clone(), |time| client.stop().after(time));
     let listening = client.until(stop);
     let name = file.display();
-    // Of a port whose name does not fit in a path, all frames would come; then it is made here.
+    // A port name that does not fit in a path would select all frames; the capture is then made here.
     let route = match port {
         None => Some("capture.pcapng".to_owned()),
         Some(port) if is_plain(port) => Some(format!("capture.pcapng?port={port}")),
@@ -56,13 +56,13 @@ pub fn capture(
     Ok(Answer::new(serde_json::json!({ "file": name.to_string() }), text))
 }
 
-/// Writes the blocks of a capture as they come; what it was, in words.
+/// Writes the blocks of a capture as they arrive; returns a description.
 fn from_host(mut events: EventStream<'_>, path: &Path) -> Result<String, Failure> {
     let refused = |error: std::io::Error| Failure::wrong(format!("{}: {error}", path.display()));
     replaceable(path).map_err(refused)?;
     let mut file = File::create(path).map_err(refused)?;
     let mut len = 0_u64;
-    // The bytes of a block that has not come to its end are kept for the next time: a file ends with a whole one.
+    // Bytes of an incomplete block are kept for the next round: the file always ends with a whole block.
     let mut waiting = Vec::new();
     while let Some(bytes) = events.bytes()? {
         waiting.extend(bytes);
@@ -75,11 +75,11 @@ fn from_host(mut events: EventStream<'_>, path: &Path) -> Result<String, Failure
     Ok(format!("{len} bytes"))
 }
 
-/// The length of the whole blocks of pcapng at the front; `None` if there are others.
+/// The length of the whole blocks of pcapng at the front; `None` if the bytes are something else.
 fn whole_blocks(bytes: &[u8]) -> Option<usize> {
     let mut at = 0;
     while let Some(header) = bytes.get(at..at + 8) {
-        // The gateway writes them in little-endian order.
+        // The gateway writes lengths in little-endian order.
         let len = u32::from_le_bytes([header[4], header[5], header[6], header[7]]) as usize;
         if len < 12 || !len.is_multiple_of(4) || len > MAX_BLOCK {
             return None;
@@ -92,7 +92,7 @@ fn whole_blocks(bytes: &[u8]) -> Option<usize> {
     Some(at)
 }
 
-/// Longer than any block of a gateway.
+/// Maximum length of a block, longer than any block of a gateway.
 const MAX_BLOCK: usize = 1 << 20;
 
 /// Makes a capture of the frames in the stream.
@@ -144,11 +144,11 @@ fn from_frames(client: &Client, place: &Path, port: Option<&str>) -> Result<Stri
     Ok(format!("{count} frames{lost}"))
 }
 
-/// The ports of a gateway, whose clock showed this when it is now here.
+/// The ports of a gateway whose clock is at `time_us` now.
 fn cell(config: &GatewayConfig, time_us: u64) -> Result<Cell, String> {
     let engine = Box::new(Engine::<MAX_PORTS>::new(config).map_err(|error| error.to_string())?);
     let epoch = Epoch { at: Instant::from_micros(time_us), wall: SystemTime::now() };
-    // A capture has no names.
+    // A capture has no names of frames.
     Ok(Cell::new(config, &*engine, epoch, Arc::default()))
 }
 

@@ -1,7 +1,6 @@
-//! Commands about another configuration: `config`, `push`, `apply`, `confirm`, `rollback`; and `identify`.
+//! Commands that change the configuration: `config`, `push`, `apply`, `confirm`, `rollback`; and `identify`.
 //!
-//! A file is checked here before anything is sent. A host takes its text; a board takes the image that is made of it
-//! here.
+//! A file is checked here before anything is sent. A host gets its text, a board the image that is made of it here.
 
 use std::net::IpAddr;
 use std::path::Path;
@@ -21,7 +20,7 @@ use crate::reading::{ended_words, revisions_of};
 use crate::shown;
 use crate::table::TableCell;
 
-/// A configuration that can run, as a host and as a board take it.
+/// A configuration that can run, in the forms for a host and for a board.
 #[derive(Debug, Clone)]
 pub struct Configuration {
     toml: Result<String, String>,
@@ -29,8 +28,8 @@ pub struct Configuration {
 }
 
 impl Configuration {
-    /// Reads a gateway file, with overrides that only a board takes, or an image, which only a board takes too. With a
-    /// board, it must fit that one.
+    /// Reads a gateway file, or an image, which only a board takes. Overrides, too, only work for a board. With
+    /// `board`, the configuration must fit that board.
     pub fn read(path: &Path, set: &[String], board: Option<Board>) -> Result<Self, Failure> {
         let name = path.display().to_string();
         let whole = |why: String| FileError {
@@ -44,7 +43,7 @@ impl Configuration {
         }
         let toml =
             String::from_utf8(bytes).map_err(|_| whole("neither a text nor an image of a board".into()))?;
-        // Of the text that is sent, whatever is at its path by now.
+        // Parse the text that is sent: the file may have changed by now.
         let config = file::parse_gateway(file::Text { name: &name, toml: &toml }, set)?;
         if let Err(error) = Engine::<MAX_PORTS>::new(&*config) {
             return Err(file::error_at(path, set, &["port"], error).into());
@@ -99,7 +98,7 @@ pub(crate) enum ServerRole {
 }
 
 impl ServerRole {
-    /// What a gateway says that it is.
+    /// The role that a gateway reports.
     pub(crate) fn of(client: &Client) -> Result<Self, Failure> {
         match client.json("info")?["role"].as_str() {
             Some("gateway") => Ok(Self::Host),
@@ -112,16 +111,16 @@ impl ServerRole {
     }
 }
 
-/// A configuration as a gateway keeps it.
+/// A configuration as stored by a gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Stored {
-    /// The text of a host's.
+    /// The text stored by a host.
     Toml(String),
-    /// The image of a board's.
+    /// The image stored by a board.
     Image(Vec<u8>),
 }
 
-/// The configuration that runs, or another one that is kept.
+/// The running configuration, or another stored one.
 pub fn stored(client: &Client, revision: Option<u32>) -> Result<Stored, Failure> {
     let path = revision.map_or_else(|| "config".to_owned(), |number| format!("config?revision={number}"));
     let reply = client.get(&path)?;
@@ -133,7 +132,7 @@ pub fn stored(client: &Client, revision: Option<u32>) -> Result<Stored, Failure>
 }
 
 impl Stored {
-    /// As a host or a board has it.
+    /// The stored bytes.
     pub fn bytes(&self) -> &[u8] {
         match self {
             Self::Toml(text) => text.as_bytes(),
@@ -141,7 +140,7 @@ impl Stored {
         }
     }
 
-    /// The configuration itself, as far as it says what runs: overrides of the command line are not in it.
+    /// The configuration itself, without overrides of the command line.
     pub fn read(&self) -> Result<Box<GatewayConfig>, String> {
         match self {
             Self::Toml(toml) => {
@@ -153,7 +152,7 @@ impl Stored {
     }
 }
 
-/// `config` without a file to write to.
+/// `config` without an output file.
 pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure> {
     let stored = stored(client, revision)?;
     let len = TableCell::number(stored.bytes().len());
@@ -186,7 +185,7 @@ pub struct TrialOptions {
     pub revision: Option<u32>,
 }
 
-/// `push`: stores a configuration, and puts it on trial if that is asked for.
+/// `push`: stores a configuration, and optionally puts it on trial.
 pub fn push(
     client: &Client,
     configuration: &Configuration,
@@ -196,7 +195,7 @@ pub fn push(
         ServerRole::Host => RequestBody::Toml(configuration.toml.as_deref().map_err(Failure::wrong)?),
         ServerRole::Board => RequestBody::Image(configuration.image.as_deref().map_err(Failure::wrong)?),
     };
-    // What it is based on is what is there now: a person pushes a whole file.
+    // The base is the present revision: a person pushes a whole file.
     let base = client.json("revisions")?;
     let Some(etag) = base["base"].as_str().filter(|etag| is_etag(etag)) else {
         return Err(client.refused("it names no revision that a change could be based on"));
@@ -221,7 +220,7 @@ fn is_etag(text: &str) -> bool {
 /// `apply`.
 ///
 /// # Errors
-/// If it is refused, not reached, or the revision does not start.
+/// If it is refused, the gateway is not reached, or the revision does not start.
 pub fn apply(client: &Client, trial: TrialOptions) -> Result<Answer, Failure> {
     let mut arguments = json!({ "confirm_s": trial.confirm_s });
     if let Some(revision) = trial.revision {
@@ -233,7 +232,7 @@ pub fn apply(client: &Client, trial: TrialOptions) -> Result<Answer, Failure> {
     let Some(revision) = revision.or(document["trial"]["revision"].as_u64()) else {
         return Err(client.refused("it does not say which revision it applies"));
     };
-    // A board starts again with it, and answers before.
+    // A board restarts for this, and answers before.
     let is_there = |shown: &Value| shown["running"] == revision && shown["trial"]["revision"] == revision;
     let document = match is_there(&document) {
         true => document,
@@ -242,7 +241,7 @@ pub fn apply(client: &Client, trial: TrialOptions) -> Result<Answer, Failure> {
             let mut ended = |shown: &Value| {
                 let is_on = shown["trial"]["revision"] == revision;
                 seen |= is_on;
-                // It may have ended in the same way before.
+                // An earlier trial may have ended in the same way.
                 !is_on && shown["last"]["revision"] == revision && (seen || shown["last"] != before)
             };
             until(client, &is_there, &mut ended, revision)?
@@ -257,12 +256,12 @@ pub fn apply(client: &Client, trial: TrialOptions) -> Result<Answer, Failure> {
     Ok(Answer::new(document, text).with_row(row))
 }
 
-/// Makes a request that replaces the gateway.
+/// Makes a request that replaces the running gateway.
 fn replacing(client: &Client, path: &str, arguments: &Value) -> Result<Value, Failure> {
     client.ask(&Call { more_time: REPLACING, ..Call::post(path, arguments) })
 }
 
-/// The revisions once `found` is true of them; a failure if the trial of this one has `ended` before.
+/// The revisions once `found` is true; a failure if the trial of this revision has `ended` before.
 fn until(
     client: &Client,
     found: &dyn Fn(&Value) -> bool,
@@ -303,17 +302,17 @@ pub fn confirm(client: &Client) -> Result<Answer, Failure> {
     Ok(Answer::new(document, format!("revision {live} is live\n")).with_row(row))
 }
 
-/// What `rollback` does without a trial.
+/// What `rollback` does if there is no trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WithoutTrial {
-    /// Nothing.
+    /// Refuses.
     Refuse,
-    /// It returns to the revision that was live before.
+    /// Returns to the revision that was live before.
     Previous,
 }
 
-/// `rollback`. The API steps back to the revision before if there is no trial, which is not what somebody wants who
-/// takes back a trial that has just ended by itself: so this looks first.
+/// `rollback`. Without a trial, the API steps back to the previous revision. That is not intended by a user whose trial
+/// has just ended by itself, so this checks first.
 pub fn rollback(client: &Client, without: WithoutTrial) -> Result<Answer, Failure> {
     if without == WithoutTrial::Refuse {
         let document = client.json("revisions")?;
@@ -322,7 +321,7 @@ pub fn rollback(client: &Client, without: WithoutTrial) -> Result<Answer, Failur
         }
     }
     let document = replacing(client, "rollback", &json!({}))?;
-    // Without a trial it returns to the revision before.
+    // Without a trial it returns to the previous revision.
     let revision = document["live"].as_u64().unwrap_or_default();
     let is_there = |shown: &Value| {
         shown["running"] == revision && shown["live"] == revision && shown.get("trial").is_none()
@@ -337,7 +336,7 @@ pub fn rollback(client: &Client, without: WithoutTrial) -> Result<Answer, Failur
     Ok(Answer::new(document, format!("revision {revision} runs and is live\n\n{text}")).with_row(row))
 }
 
-/// Why a trial cannot be taken back, and what could be meant.
+/// Why there is no trial to take back, and what may be intended.
 fn no_trial(revisions: &Value) -> String {
     let Some(live) = revisions["live"].as_u64() else {
         return "no revision is on trial, and none was confirmed".into();
@@ -365,9 +364,9 @@ pub fn identify(client: &Client, seconds: u32) -> Result<Answer, Failure> {
     Ok(Answer::new(document, text))
 }
 
-/// Time that a gateway may take to let its safe values out, end, and start another one.
+/// Time that a gateway may take to send its safe values, end, and start another gateway.
 const REPLACING: Duration = Duration::from_secs(10);
-/// Time that a board may take to start again.
+/// Time that a board may take to restart.
 const RESTARTING: Duration = Duration::from_secs(30);
-/// Time between two looks at a board that starts again.
+/// Poll interval for a restarting board.
 const AGAIN: Duration = Duration::from_millis(300);

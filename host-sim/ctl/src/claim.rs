@@ -1,8 +1,8 @@
 //! `claim`: a board's first key.
 //!
-//! A board without a key takes one within a minute of a press of its button. The key is made here, and is in its file
-//! before it is sent: a key that a board has and nobody else would lock everybody out. It is sent once, and only while
-//! the board says that it takes one.
+//! A board without a key accepts one within a minute after its button is pressed. The key is made here and written to
+//! its file before it is sent: a key that only the board knows would lock everybody out. It is sent once, and only
+//! while the board reports that it accepts a key.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -15,10 +15,10 @@ use crate::failure::Failure;
 use crate::key_file;
 use crate::shown;
 
-/// `claim`. `tell` gets a line for people now and then.
+/// `claim`. `tell` gets progress messages.
 ///
 /// # Errors
-/// If it is no board, has another key, nobody presses the button in time, or the file cannot be written.
+/// If it is not a board, it has another key, nobody presses the button in time, or the file cannot be written.
 pub fn claim(client: &Client, file: &Path, tell: &mut dyn FnMut(&str)) -> Result<Answer, Failure> {
     let name = file.display();
     let info = client.json("info")?;
@@ -32,7 +32,7 @@ pub fn claim(client: &Client, file: &Path, tell: &mut dyn FnMut(&str)) -> Result
     if info["claimed"] == true && is_new {
         return Err(client.refused("it has a key already; only who has that can ask or change it"));
     }
-    // One that exists was left by an attempt whose answer was lost, or whose button nobody pressed.
+    // An existing key is from an attempt whose answer was lost, or whose button nobody pressed.
     let (key, digits) = if is_new { key_file::make(file)? } else { key_file::read_with_digits(file)? };
     let owner = client.with_key(key);
     if info["claimed"] == true {
@@ -58,7 +58,7 @@ fn done(client: &Client, file: &Path, what: &str) -> Answer {
     Answer::new(json!({ "claimed": true, "key": name.to_string() }), text)
 }
 
-/// Waits until the board takes a key.
+/// Waits until the board accepts a key.
 fn wait(client: &Client, info: &Value, name: &str, tell: &mut dyn FnMut(&str)) -> Result<(), Failure> {
     let is_open = |info: &Value| info["claim_left_s"].as_f64().is_some_and(|left| left > MIN_LEFT_S);
     if is_open(info) {
@@ -72,7 +72,7 @@ fn wait(client: &Client, info: &Value, name: &str, tell: &mut dyn FnMut(&str)) -
         if client.stop().wait(AGAIN) {
             return Err(client.refused("ended before the button was pressed; nothing was sent"));
         }
-        // It may be away for a moment, such as while it starts.
+        // The board may be unreachable for a moment, such as during its start.
         match client.json("info") {
             Ok(info) if is_open(&info) => return Ok(()),
             Ok(info) if info["claimed"] == true => {
@@ -93,6 +93,6 @@ fn wait(client: &Client, info: &Value, name: &str, tell: &mut dyn FnMut(&str)) -
 
 /// Time to press the button.
 const WINDOW: Duration = Duration::from_secs(60);
-/// A key that is sent later than this before the end of the board's own minute might come too late.
+/// Minimum time left of the board's own minute: a key sent later might arrive too late.
 const MIN_LEFT_S: f64 = 1.0;
 const AGAIN: Duration = Duration::from_millis(500);

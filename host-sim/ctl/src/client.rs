@@ -1,8 +1,8 @@
 //! A client of one gateway.
 //!
-//! In: requests of docs/api.md. Out: answers, or a failure in words. Signs what needs the key: everything over a
-//! network, and what changes something on the own machine. The key itself is never sent, also not on the own
-//! machine, where the API would take it: a forwarded port leads to another one.
+//! In: requests of docs/api.md. Out: answers, or a failure in words. Signs everything that needs the key: all requests
+//! over a network, and changes on this machine. The key itself is never sent, not even on localhost, where the API
+//! would accept it: a forwarded port leads to another machine.
 
 use std::cell::RefCell;
 use std::io::ErrorKind;
@@ -66,11 +66,11 @@ impl RequestBody<'_> {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Call<'a> {
     pub(crate) method: &'static str,
-    /// Behind [`API`], with its query.
+    /// The path after [`API`], with its query.
     pub(crate) path: &'a str,
     pub(crate) body: RequestBody<'a>,
     pub(crate) if_match: Option<&'a str>,
-    /// Time in addition to that of every request: the gateway is replaced meanwhile.
+    /// Additional timeout for a request that replaces the gateway.
     pub(crate) more_time: Duration,
 }
 
@@ -94,8 +94,8 @@ impl Client {
         Ok(Self { address, places, host: None, key, timeout, stop, nonce: RefCell::new(None) })
     }
 
-    /// The same, if the gateway knows itself by another address than the one that leads to it, such as a forwarded
-    /// port.
+    /// Sets the address that the gateway knows itself by, if it differs from the one that leads to it, such as a
+    /// forwarded port.
     #[must_use]
     pub fn known_as(self, host: Option<Address>) -> Self {
         Self { host, ..self }
@@ -118,7 +118,7 @@ impl Client {
         &self.stop
     }
 
-    /// A failure of this gateway in words.
+    /// A failure at this gateway, in words.
     pub(crate) fn refused(&self, why: impl std::fmt::Display) -> Failure {
         Failure::Refused(format!("{}: {}", self.address, shown::line(&why.to_string())))
     }
@@ -127,7 +127,7 @@ impl Client {
         self.ask(&Call::get(path))
     }
 
-    /// A document that this server may not have: `None` if there is no such path.
+    /// An optional document: `None` if there is no such path.
     pub(crate) fn json_if_there(&self, path: &str) -> Result<Option<Value>, Failure> {
         let reply = self.call(&Call::get(path))?;
         match reply.status() {
@@ -150,7 +150,7 @@ impl Client {
         }
     }
 
-    /// Makes a request, and returns the document of its answer.
+    /// Makes a request and returns the document of its answer.
     pub(crate) fn ask(&self, call: &Call<'_>) -> Result<Value, Failure> {
         self.document(&self.accepted(self.call(call)?)?)
     }
@@ -182,7 +182,7 @@ impl Client {
         Ok(EventStream { client: self, stream })
     }
 
-    /// Opens a stream that this server may not have: `None` if there is no such path.
+    /// Opens an optional stream: `None` if there is no such path.
     pub(crate) fn stream_if_there(&self, path: &str) -> Result<Option<EventStream<'_>>, Failure> {
         let exchange = self.open(path)?;
         if exchange.status() == 404 {
@@ -195,8 +195,8 @@ impl Client {
         self.asked_again(call, || Ok(self.exchange(call)?.finish()?))
     }
 
-    /// Reads until it is not reset any more: a board whose places are taken does that to a forwarded port, and to what
-    /// it has to cut off. What changes something is asked once, as it may have been done.
+    /// Retries a GET on connection reset: a board without a free connection resets a forwarded port, and a connection
+    /// that it has to cut off. A change is requested only once, as it may have been executed.
     fn asked_again<T>(
         &self,
         call: &Call<'_>,
@@ -225,8 +225,8 @@ impl Client {
             nonce => nonce,
         };
         let exchange = self.send(call, nonce.as_deref())?;
-        // The nonce had become old, or it needs the key after all. A fresh nonce means that the key is wrong,
-        // and asking again would count as another wrong one.
+        // The nonce was old, or the request needs the key after all. With a fresh nonce the key is wrong, and a retry
+        // would count as another wrong key.
         let again = exchange.status() == 401 && self.key.is_some() && (nonce.is_none() || is_kept);
         if !again {
             self.nonce.replace(exchange.field("next-nonce").and_then(fit_nonce));
@@ -237,7 +237,7 @@ impl Client {
         self.send(call, Some(&nonce))
     }
 
-    /// Whether it needs no key: reading on this machine.
+    /// Whether the request needs no key: reading on this machine.
     fn is_open(&self, call: &Call<'_>) -> bool {
         call.method == "GET" && self.places.iter().copied().all(is_here)
     }
@@ -309,7 +309,7 @@ impl Client {
         }
     }
 
-    /// A refusal in words. A configuration that is wrong is a wrong file.
+    /// A refusal in words. A wrong configuration counts as a wrong file.
     pub(crate) fn refusal(&self, reply: &HttpReply) -> Failure {
         let document: Value = serde_json::from_slice(&reply.body).unwrap_or_default();
         let status = reply.status();
@@ -340,23 +340,23 @@ impl Client {
             _ => String::new(),
         };
         let key = document["key"].as_str().map(|key| format!("{}: ", shown::line(key))).unwrap_or_default();
-        // Only a configuration has places and keys.
+        // Only configurations have places and keys.
         let what =
             if place.is_empty() && key.is_empty() { "it is refused" } else { "the configuration is refused" };
         Failure::Wrong(format!("{}: {what}: {place}{key}{said}", self.address))
     }
 }
 
-/// Whether it is on this machine.
+/// Whether the address is on this machine.
 fn is_here(place: SocketAddr) -> bool {
     place.ip().to_canonical().is_loopback()
 }
 
 /// Why a request was not answered.
 enum Missed {
-    /// There was none, or not to its end.
+    /// No answer, or an incomplete one.
     Answer(NoReply),
-    /// In words already: it was not reached, or has refused.
+    /// A failure in words: the gateway was not reached or has refused.
     For(Failure),
 }
 
@@ -372,9 +372,9 @@ impl From<Failure> for Missed {
     }
 }
 
-/// A board has four places for connections, and turns others away while they are taken: it is asked so many times.
+/// Number of attempts. A board has four connections and refuses others while these are in use.
 const ATTEMPTS: u32 = 6;
-/// Between two of them.
+/// Pause between two attempts.
 const AGAIN: Duration = Duration::from_millis(200);
 
 #[derive(Debug)]
@@ -384,7 +384,7 @@ pub(crate) struct EventStream<'a> {
 }
 
 impl EventStream<'_> {
-    /// The next event; `None` once the command shall end.
+    /// The next event; `None` once the command is to end.
     pub(crate) fn next(&mut self) -> Result<Option<ServerEvent>, Failure> {
         match self.stream.event() {
             Ok(Some(event)) => Ok(Some(event)),
@@ -394,7 +394,7 @@ impl EventStream<'_> {
         }
     }
 
-    /// The next bytes, of a stream that has no events; `None` once it or the command ends.
+    /// The next bytes of a stream without events; `None` once the stream or the command ends.
     pub(crate) fn bytes(&mut self) -> Result<Option<Vec<u8>>, Failure> {
         match self.stream.bytes() {
             Ok(bytes) => Ok(bytes),
@@ -404,7 +404,7 @@ impl EventStream<'_> {
     }
 }
 
-/// A nonce as it may stand in a head: nothing that a server sends may add lines to it.
+/// A nonce that is safe in a head: nothing from a server may add lines to it.
 fn fit_nonce(text: &str) -> Option<String> {
     let is_fit = (16..=128).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_hexdigit());
     is_fit.then(|| text.to_owned())

@@ -10,18 +10,17 @@ use recipe_io::files::{Beside, read_private};
 
 use crate::failure::Failure;
 
-/// More than a key and its line end.
+/// Maximum length of a file, more than a key and its line end.
 pub(crate) const MAX_FILE: u64 = 100;
 
-/// The digits of a private key. Error messages do not repeat them: a mistyped key is
-/// almost one.
+/// The digits of a private key. Error messages do not repeat them: a mistyped key is almost the key.
 pub(crate) fn read(path: &Path) -> Result<String, Failure> {
     let mut text = read_private(path, MAX_FILE).map_err(|error| wrong(path, &error))?;
     text.truncate(text.trim_end().len());
     Ok(text)
 }
 
-/// Writes a new file, so that it is there as a whole, on the disk, before its name is.
+/// Writes a new file atomically: it is complete and on the disk before its name exists.
 pub(crate) fn write_new(path: &Path, digits: &str, mode: u32) -> Result<(), Failure> {
     let written = || {
         let new = |name: &Path| File::options().write(true).create_new(true).mode(mode).open(name);

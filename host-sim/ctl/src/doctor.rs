@@ -1,7 +1,7 @@
 //! `doctor`: why does it not work?
 //!
-//! A host's gateway says it itself. For a board it is found here: from its configuration, and from some seconds of its
-//! stream, with the same rules.
+//! A gateway on a host reports this itself. For a board, the same rules are applied here to its configuration and to
+//! some seconds of its stream.
 
 use std::collections::BTreeMap;
 use std::time::Duration as StdDuration;
@@ -21,7 +21,7 @@ use crate::frames::FramesDocument;
 use crate::shown;
 use crate::table::{Look, TableCell, paint};
 
-/// `doctor`. Listens for `time` if the gateway does not say by itself what is wrong.
+/// `doctor`. Listens for `time` if the gateway does not report findings itself.
 pub fn doctor(client: &Client, time: StdDuration) -> Result<Answer, Failure> {
     let findings = match client.json_if_there("doctor")? {
         Some(document) => document["findings"].as_array().cloned().unwrap_or_default(),
@@ -72,12 +72,12 @@ fn answer(findings: Vec<Value>) -> Answer {
     Answer::new(json!({ "findings": findings }), text).with_row(row).with_verdict(is_well)
 }
 
-/// Listens to the stream, and looks at what has come.
+/// Listens to the stream and examines the data.
 fn listen(client: &Client, time: StdDuration) -> Result<Vec<Finding>, Failure> {
     let config =
         stored(client, None)?.read().map_err(|why| client.refused(format!("its configuration: {why}")))?;
     let uptime = client.json("info")?["uptime_s"].as_u64().unwrap_or(0);
-    // Counters of a whole window are compared.
+    // Counters are compared over a whole window.
     let window = StdDuration::from_micros(WINDOW.as_micros());
     let stop = client.stop().after(time.max(window + StdDuration::from_millis(500)));
     let listening = client.until(stop);
@@ -102,13 +102,13 @@ fn listen(client: &Client, time: StdDuration) -> Result<Vec<Finding>, Failure> {
         .map_err(|why| client.refused(why))
 }
 
-/// What has come of a stream.
+/// Data received from a stream.
 struct Heard<'a> {
     config: &'a GatewayConfig,
     records: Vec<PortRecord>,
     noted: Option<Instant>,
     newest: Option<StatusDocument>,
-    /// Since when a link has been seen up without a break: how often it had come up, and the instant.
+    /// For each link that is up: how often it had come up, and since when it has been seen up without a break.
     up: BTreeMap<String, (u32, Instant)>,
 }
 

@@ -1,4 +1,4 @@
-//! The edge node of a board: what it does, and other settings for it (docs/api.md section 10).
+//! The edge node of a board: its state, and new settings for it (docs/api.md section 10).
 
 use std::time::{Duration, Instant};
 
@@ -9,27 +9,27 @@ use crate::client::{Call, Client, RequestBody};
 use crate::failure::Failure;
 use crate::table::{TableCell, facts};
 
-/// When settings that are kept take effect.
+/// When stored settings take effect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum From {
-    /// With the next start, whenever that is.
+    /// At the next restart, whenever that is.
     NextStart,
-    /// With a start at once.
+    /// At an immediate restart.
     Now,
 }
 
-/// How the edge node of a board does.
+/// The state of a board's edge node.
 ///
 /// # Errors
-/// If it is refused, such as by a gateway on a host, or not reached.
+/// If it is refused, such as by a gateway on a host, or the board is not reached.
 pub fn shown(client: &Client) -> Result<Answer, Failure> {
     client.json("edge").map(answer)
 }
 
-/// Keeps settings for the edge node of a board, in the form that a board takes.
+/// Stores settings for the edge node of a board, in the board's format.
 ///
 /// # Errors
-/// If it is refused or not reached, or the board does not come back.
+/// If it is refused, the board is not reached, or it does not come back.
 pub fn set(client: &Client, settings: &[u8], from: From) -> Result<Answer, Failure> {
     let (path, more_time) = match from {
         From::NextStart => ("edge", Duration::ZERO),
@@ -48,7 +48,7 @@ fn restarted(client: &Client) -> Result<Value, Failure> {
     loop {
         let last = client.json("edge");
         match &last {
-            // Before the restart it still says what is kept for it; after it, it takes a moment to connect.
+            // Before the restart, the board still reports the stored settings; after it, connecting takes a moment.
             Ok(document) if document.get("next").is_none() && !is_trying(document) => return last,
             Ok(document) if document.get("next").is_none() && Instant::now() > deadline => return last,
             _ if Instant::now() > deadline => {
@@ -64,7 +64,7 @@ fn restarted(client: &Client) -> Result<Value, Failure> {
     }
 }
 
-/// Whether it has neither a session nor a reason why not.
+/// Whether the node has neither a session nor a reason for having none.
 fn is_trying(document: &Value) -> bool {
     document["state"] == "offline" && document.get("why").is_none()
 }
@@ -97,6 +97,6 @@ fn answer(document: Value) -> Answer {
     Answer::new(document, text).with_row(row.into()).with_verdict(is_well)
 }
 
-/// How long a board may take to start again.
+/// Time that a board may take to restart.
 const RESTARTING: Duration = Duration::from_secs(30);
 const AGAIN: Duration = Duration::from_millis(200);

@@ -1,21 +1,21 @@
-//! Why a command did not do what it was asked for, and what the exit code says.
+//! Why a command failed, and the results that determine the exit code.
 
 use std::fmt;
 use std::io;
 
-/// How a command ended that did what it was asked for.
+/// The result of a command that was executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
     /// Nothing is wrong.
     Well,
-    /// The gateway, or its doctor, says that something is.
+    /// The gateway or its doctor reports a problem.
     Trouble,
 }
 
-/// Why a command did not.
+/// Why a command was not executed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Failure {
-    /// The gateway refused, or was not reached.
+    /// The gateway refused the request or was not reached.
     Refused(String),
     /// A file or an argument is wrong.
     Wrong(String),
@@ -24,12 +24,12 @@ pub enum Failure {
 }
 
 impl Failure {
-    /// A refusal in these words.
+    /// A refusal with this text.
     pub fn refused(words: impl fmt::Display) -> Self {
         Self::Refused(words.to_string())
     }
 
-    /// A mistake in a file or an argument, in these words.
+    /// A mistake in a file or an argument, with this text.
     pub fn wrong(words: impl fmt::Display) -> Self {
         Self::Wrong(words.to_string())
     }
@@ -43,7 +43,7 @@ impl Failure {
     }
 }
 
-/// Writing output is all that fails with such an error.
+/// Only writing output fails with an `io::Error`.
 impl From<io::Error> for Failure {
     fn from(_: io::Error) -> Self {
         Self::Printing

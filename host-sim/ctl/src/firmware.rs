@@ -1,4 +1,4 @@
-//! Update files: made of two linked programs and a key, and shown (docs/update.md sections 2 and 3).
+//! Update files: making them from two linked programs and a key, and showing them (docs/update.md sections 2 and 3).
 
 use std::path::{Path, PathBuf};
 
@@ -18,7 +18,7 @@ use crate::failure::Failure;
 use crate::signing_key;
 use crate::table::{Look, TableCell, TableView, TextTable, facts};
 
-/// What an update is made of.
+/// The input for an update file.
 #[derive(Debug, Clone)]
 pub struct Firmware {
     /// The file with the private key.
@@ -31,9 +31,9 @@ pub struct Firmware {
     pub slot_a: PathBuf,
     /// The program linked for slot B.
     pub slot_b: PathBuf,
-    /// The oldest and newest version of the configuration image that it reads; that of this program if not given.
+    /// Oldest and newest version of the configuration image that the firmware reads; by default those of this program.
     pub reads: Option<(u32, u32)>,
-    /// The one that it writes.
+    /// The version that the firmware writes.
     pub writes: Option<u32>,
 }
 
@@ -119,7 +119,7 @@ fn image_of(elf: &[u8], layout: &Layout, slot: Slot) -> Result<Vec<u8>, String> 
     Ok(image)
 }
 
-/// An update file that was read.
+/// A parsed update file.
 #[derive(Debug, Clone)]
 pub struct Update {
     bytes: Vec<u8>,
@@ -134,22 +134,22 @@ impl Update {
         Ok(Self { bytes })
     }
 
-    /// Of the bytes that [`sign`] has made.
+    /// Parses the bytes that [`sign`] has made.
     pub fn of(bytes: Vec<u8>) -> Result<Self, Failure> {
         UpdateFile::parse(&bytes).map_err(Failure::wrong)?;
         Ok(Self { bytes })
     }
 
-    /// What it has for each slot.
+    /// The images for the slots.
     pub fn links(&self) -> Vec<SlotImage<'_>> {
-        // It was read before.
+        // The bytes were parsed before.
         UpdateFile::parse(&self.bytes).map_or(Vec::new(), |file| file.links().copied().collect())
     }
 
-    /// What a probe writes at the beginning of a slot, and where that is.
+    /// The address of a slot, and the bytes that a debug probe writes there.
     ///
     /// # Errors
-    /// The file has no firmware for it, or it is for a board that this program does not know.
+    /// The file has no firmware for the slot, or is for a board that this program does not know.
     pub fn flat(&self, slot: Slot) -> Result<(u32, Vec<u8>), Failure> {
         let links = self.links();
         let link = links.iter().find(|link| link.header.slot() == slot);
@@ -164,7 +164,7 @@ impl Update {
         Ok((layout.slot(slot), bytes))
     }
 
-    /// What it contains, and whether that is what was signed.
+    /// The content, and whether it is what was signed.
     pub fn inspect(&self, public: Option<&Path>, view: TableView) -> Result<Answer, Failure> {
         let key = public.map(signing_key::read_public).transpose()?;
         let links = self.links();
@@ -225,7 +225,7 @@ impl Update {
         Ok(Answer::new(document, text).with_verdict(is_well))
     }
 
-    /// One line: what it is, and for the key of which signature.
+    /// One line with the content, and the key that the signature belongs to.
     pub fn summary(&self, public: &PublicKey) -> String {
         let links = self.links();
         let sizes: Vec<String> = links

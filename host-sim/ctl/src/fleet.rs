@@ -1,7 +1,7 @@
-//! Several gateways at once: those of an inventory.
+//! Commands for several gateways of an inventory.
 //!
-//! In: an inventory, a command. Out: what each answered. Each is asked by a thread of its own, at most
-//! [`MAX_AT_ONCE`] at a time; one that does not answer delays no other.
+//! In: an inventory, a command. Out: the answer of each gateway. Each is asked by a thread of its own, at most
+//! [`MAX_AT_ONCE`] at a time; a gateway that does not answer delays no other.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
@@ -20,7 +20,7 @@ use crate::key_file;
 use crate::stop::Stop;
 use crate::table::{Look, TableCell, TableView, TextTable};
 
-/// Gateways that are asked at a time.
+/// Maximum number of gateways that are asked at a time.
 pub const MAX_AT_ONCE: usize = 16;
 
 /// One gateway of an inventory, with its address and key.
@@ -38,20 +38,20 @@ impl Member {
         &self.name
     }
 
-    /// A client of it.
+    /// A client for the gateway.
     ///
     /// # Errors
-    /// If its host name cannot be resolved.
+    /// If the host name cannot be resolved.
     pub fn client(&self, timeout: Duration, stop: Stop) -> Result<Client, Failure> {
         let client = Client::new(self.address.clone(), self.key.clone(), timeout, stop)?;
         Ok(client.known_as(self.host.clone()))
     }
 }
 
-/// Reads an inventory and the keys that it names. With names in `only`, those alone.
+/// Reads an inventory and its keys; with names in `only`, just those gateways.
 ///
 /// # Errors
-/// A mistake in the file, with its place; a key that cannot be read; a name that it does not have.
+/// A mistake in the file, with its place; an unreadable key; a name that is not in the inventory.
 pub fn members(path: &Path, only: &[String]) -> Result<Vec<Member>, Failure> {
     let listed = load_inventory(path, |address| address.parse::<Address>().map(|_| ()))?;
     for name in only {
@@ -76,16 +76,16 @@ pub fn members(path: &Path, only: &[String]) -> Result<Vec<Member>, Failure> {
         .collect()
 }
 
-/// How a change goes through an inventory.
+/// How a change is rolled out to an inventory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rollout {
-    /// So many at a time; the next ones begin once these have ended.
+    /// Number of gateways in a batch; the next batch begins once this one has ended.
     pub batch: usize,
-    /// Begin no further batch once one has failed.
+    /// Begin no further batch once a gateway has failed.
     pub stop_on_failure: bool,
 }
 
-/// What became of a command at each gateway of an inventory.
+/// The results of a command at the gateways of an inventory.
 #[derive(Debug)]
 pub struct Outcomes(Vec<(String, MemberOutcome)>);
 
@@ -93,11 +93,11 @@ pub struct Outcomes(Vec<(String, MemberOutcome)>);
 enum MemberOutcome {
     Answered(Box<Answer>),
     Failed(Failure),
-    /// One before has failed, or somebody pressed Ctrl-C.
+    /// An earlier gateway has failed, or Ctrl-C was pressed.
     NotBegun,
 }
 
-/// Asks all of them. Without a rollout all are one batch.
+/// Asks all gateways. Without a rollout all are one batch.
 pub fn ask(
     members: &[Member],
     rollout: Option<Rollout>,
@@ -131,8 +131,8 @@ pub fn ask(
     Outcomes(outcomes)
 }
 
-/// The result of `work` for each item, at most [`MAX_AT_ONCE`] at a time; that of `not_begun` for those that had not
-/// begun when the end was asked for.
+/// The result of `work` for each item, at most [`MAX_AT_ONCE`] at a time; `not_begun` for items that had not begun when
+/// the end was requested.
 pub(crate) fn side_by_side<I: Sync, T: Send>(
     items: &[I],
     stop: &Stop,
@@ -158,7 +158,7 @@ pub(crate) fn side_by_side<I: Sync, T: Send>(
 }
 
 impl Outcomes {
-    /// Whether all have answered, and whether all is well with them; a failure names those that have not.
+    /// Whether all have answered without a problem; a failure names those that have not answered.
     pub fn verdict(&self) -> Result<Verdict, Failure> {
         let failed = self.0.iter().filter(|(_, outcome)| !matches!(outcome, MemberOutcome::Answered(_)));
         let names: Vec<_> = failed.map(|(name, _)| name.as_str()).collect();
@@ -173,7 +173,7 @@ impl Outcomes {
         Ok(if self.0.iter().all(is_well) { Verdict::Well } else { Verdict::Trouble })
     }
 
-    /// A table with a row for each.
+    /// A table with a row for each gateway.
     pub fn table(&self, view: TableView) -> String {
         let headings: Vec<&str> = self
             .0
@@ -210,7 +210,7 @@ impl Outcomes {
         table.show(view)
     }
 
-    /// The whole answers, one below the other.
+    /// The complete answers, one below the other.
     pub fn sections(&self, view: TableView) -> String {
         let mut text = String::new();
         for (name, outcome) in &self.0 {
@@ -224,7 +224,7 @@ impl Outcomes {
         text
     }
 
-    /// One document for all, on one line.
+    /// One document with all answers, on one line.
     pub fn json(&self) -> String {
         let entry = |outcome: &MemberOutcome| match outcome {
             MemberOutcome::Answered(answer) => json!({ "ok": true, "answer": answer.document }),

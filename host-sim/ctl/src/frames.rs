@@ -1,6 +1,6 @@
-//! The frames that a gateway's stream brings.
+//! Frames from a gateway's stream.
 //!
-//! In: the data of an event `frames`. Out: frames as they were at the ports, with the names that the gateway gave them.
+//! In: the data of an event `frames`. Out: frames as recorded at the ports, with the names given by the gateway.
 
 use std::fmt::Write;
 
@@ -18,7 +18,7 @@ use crate::shown;
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct FramesDocument {
     pub(crate) frames: Vec<FrameDocument>,
-    /// Frames that this client missed before these.
+    /// Number of frames that this client missed before these.
     #[serde(default)]
     pub(crate) lost: u64,
 }
@@ -26,7 +26,7 @@ pub(crate) struct FramesDocument {
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct FrameDocument {
     pub(crate) time_us: u64,
-    /// The field port that it was at.
+    /// The field port of the frame.
     pub(crate) port: String,
     direction: Direction,
     /// `frame`, or why it was rejected.
@@ -35,13 +35,13 @@ pub(crate) struct FrameDocument {
     text: Option<String>,
     /// Hexadecimal digits.
     bytes: String,
-    /// Its number on CAN.
+    /// The id on CAN.
     id: Option<u32>,
     #[serde(default)]
     extended: bool,
-    /// Its length, if not all bytes are there.
+    /// Length in bytes, if not all bytes are present.
     len: Option<usize>,
-    /// Which of the port's frames it is.
+    /// The name of the frame.
     name: Option<String>,
     values: Option<Map<String, Value>>,
 }
@@ -58,7 +58,7 @@ impl FrameDocument {
         self.direction == Direction::In
     }
 
-    /// The bytes; `None` if they are no hexadecimal digits.
+    /// The bytes; `None` if the text is not hexadecimal.
     pub(crate) fn bytes(&self) -> Option<Vec<u8>> {
         let digits: Option<Vec<u8>> =
             self.bytes.chars().map(|c| c.to_digit(16).map(|digit| digit as u8)).collect();
@@ -74,7 +74,7 @@ impl FrameDocument {
         }
     }
 
-    /// Why it was rejected; a reason that this program does not know counts as one that it does.
+    /// Why the frame was rejected; a reason unknown to this program is replaced by a known one.
     fn rejection(&self) -> Option<Rejection> {
         if self.verdict == "frame" {
             return None;
@@ -87,7 +87,7 @@ impl FrameDocument {
         Rejection::deserialize(name).ok()
     }
 
-    /// The same as the engine's tap has it; `None` if it is not one.
+    /// The frame as the engine's tap records it; `None` if it is not valid.
     pub(crate) fn frame(&self, port: PortId) -> Option<Frame> {
         let bytes = self.bytes()?;
         Some(Frame {
@@ -100,7 +100,7 @@ impl FrameDocument {
         })
     }
 
-    /// On one line: the direction, and names and values or what was wrong, with the bytes.
+    /// One line: the direction, names and values or the rejection, and the bytes.
     pub(crate) fn line(&self, decoded: Option<(&str, &Value)>) -> String {
         let mut line = String::from(if self.is_in() { "in   " } else { "out  " });
         let own = self.values.as_ref().map(|values| (self.name.as_deref().unwrap_or_default(), values));
@@ -131,7 +131,7 @@ impl FrameDocument {
         line
     }
 
-    /// The bytes as `host-sim decode` takes them.
+    /// The bytes in the form that `host-sim decode` takes.
     fn hex(&self) -> String {
         let Some(bytes) = self.bytes() else { return "no bytes".into() };
         match self.can_id() {

@@ -1,4 +1,4 @@
-//! Files with a key: 32 hexadecimal digits that nobody else can read.
+//! Files with a key: 32 hexadecimal digits that only the owner can read.
 
 use std::io;
 use std::path::Path;
@@ -17,7 +17,7 @@ pub fn read(path: &Path) -> Result<Key, Failure> {
     read_with_digits(path).map(|(key, _)| key)
 }
 
-/// The same with its digits, to give them to a board.
+/// As [`read`], with the digits, which are sent to a board.
 pub(crate) fn read_with_digits(path: &Path) -> Result<(Key, String), Failure> {
     let digits = digits::read(path)?;
     let key = Key::parse(&digits)
@@ -25,10 +25,10 @@ pub(crate) fn read_with_digits(path: &Path) -> Result<(Key, String), Failure> {
     Ok((key, digits))
 }
 
-/// Makes a key of 128 random bits and writes it to a new file of mode 0600. Returns it, and its digits.
+/// Makes a key of 128 random bits and writes it to a new file of mode 0600. Returns the key and its digits.
 ///
 /// # Errors
-/// If there is a file already, or it cannot be written.
+/// If the file exists or cannot be written.
 pub fn make(path: &Path) -> Result<(Key, String), Failure> {
     let (key, digits) = new().map_err(|error| wrong(path, &error))?;
     digits::write_new(path, &digits, 0o600)?;
@@ -38,7 +38,7 @@ pub fn make(path: &Path) -> Result<(Key, String), Failure> {
 fn new() -> io::Result<(Key, String)> {
     loop {
         let digits = Hex(&random::<KEY_LEN>()?).to_string();
-        // One of 2^124 is a filler, such as all zeros.
+        // One key of 2^124 is refused as a placeholder, such as all zeros.
         if let Some(key) = Key::parse(&digits) {
             return Ok((key, digits));
         }

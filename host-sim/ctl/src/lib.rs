@@ -1,8 +1,8 @@
 //! A client of the API of gateways, on hosts and on boards (docs/api.md): what `host-sim ctl` does.
 //!
-//! In: the address of a gateway, or an inventory of many; a command. Out: answers as text, as JSON, or as files. Needs
-//! no runtime: a gateway is asked by one thread, several by several. Everything that a gateway says is input like any
-//! other: it is bounded, and never reaches a terminal as it came.
+//! In: the address of a gateway, or an inventory of many; a command. Out: answers as text, as JSON, or as files. Does
+//! not need an async runtime: each gateway is asked by one thread. Answers of gateways are untrusted input: they are
+//! limited, and never reach a terminal unescaped.
 
 #![forbid(unsafe_code)]
 

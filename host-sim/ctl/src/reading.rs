@@ -1,4 +1,4 @@
-//! Commands that only read: who it is, its state, its variables, its revisions, its log.
+//! Commands that only read: identity, state, variables, revisions, log.
 
 use serde_json::{Value, json};
 
@@ -47,7 +47,7 @@ pub fn info(client: &Client) -> Result<Answer, Failure> {
     Ok(Answer::new(document.clone(), text).with_row(row))
 }
 
-/// Whether it takes changes, in words.
+/// Whether the gateway accepts changes, in words.
 fn changes(info: &Value) -> TableCell {
     match (info["claimed"].as_bool(), info["claim_left_s"].as_f64(), info["can_be_changed"].as_bool()) {
         (Some(false), Some(left), _) => format!("it takes a key for {left:.0} s more").into(),
@@ -64,7 +64,7 @@ pub fn status(client: &Client, view: TableView) -> Result<Answer, Failure> {
 
 pub(crate) fn status_of(document: Value, view: TableView) -> Answer {
     let health = document["health"].as_str().unwrap_or_default();
-    // A simulated controller has none.
+    // A simulated controller has no health.
     let is_well = health.is_empty() || health == "running";
     let controller = controller(&document["controller"]);
     let look = if is_well { Look::Well } else { Look::Wrong };
@@ -109,7 +109,7 @@ fn ports(document: &Value) -> TextTable {
     let mut table = TextTable::new(&headings);
     for (name, port) in document["ports"].as_object().into_iter().flatten() {
         let counters = &port["counters"];
-        // Those for other nodes of a CAN bus are none of ours, and a rejected field is no frame.
+        // Frames for other nodes of a CAN bus do not count, nor do rejected fields.
         let is_rejection = |key: &str| {
             (key.starts_with("rejected_")
                 && !matches!(key, "rejected_id" | "rejected_remote" | "rejected_fields"))
@@ -118,7 +118,7 @@ fn ports(document: &Value) -> TextTable {
         let counted = counters.as_object().into_iter().flatten();
         let rejected: u64 =
             counted.filter(|(key, _)| is_rejection(key)).filter_map(|(_, count)| count.as_u64()).sum();
-        // A frame that never was one is no rejected frame: of it only bytes are counted.
+        // Bytes that never were a frame are counted in bytes.
         let skipped: u64 =
             ["resync_bytes", "discarded_bytes"].iter().filter_map(|key| counters[key].as_u64()).sum();
         let shown = match skipped {
@@ -199,7 +199,7 @@ fn latencies(document: &Value) -> TextTable {
     table
 }
 
-/// `values`: the variables whose names contain one of the filters, capitals or not.
+/// `values`: the variables whose names contain one of the filters, ignoring case.
 pub fn values(client: &Client, filters: &[String], view: TableView) -> Result<Answer, Failure> {
     Ok(values_of(client.json("values")?, filters, view))
 }
@@ -337,7 +337,7 @@ fn stored(at: &Value) -> String {
 /// Seconds since 1970 as `2025-01-31 12:00:00 UTC`.
 fn utc(seconds: u64) -> String {
     let (days, rest) = (seconds / 86_400, seconds % 86_400);
-    // Days are counted in years that begin in March, so that the leap day is the last one.
+    // Years are counted from March, so the leap day is the last day of a year.
     let shifted = days + 719_468;
     let (era, day) = (shifted / 146_097, shifted % 146_097);
     let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
@@ -353,11 +353,11 @@ fn count(value: &Value) -> TableCell {
     TableCell::number(value.as_u64().map(|count| count.to_string()).unwrap_or_default())
 }
 
-/// A number as people read it.
+/// A number as text.
 pub(crate) fn number(value: &Value) -> String {
     match (value.as_i64(), value.as_f64()) {
         (Some(integer), _) => integer.to_string(),
-        // What is a number of 32 bits has no more digits than it needs.
+        // A 32-bit float has no more digits than it needs.
         (None, Some(float)) => (float as f32).to_string(),
         _ => value.as_str().map_or_else(|| value.to_string(), str::to_owned),
     }

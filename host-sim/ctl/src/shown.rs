@@ -1,11 +1,11 @@
-//! What a gateway says, made fit for a terminal: no control characters, nothing that turns the direction of text.
+//! Escapes answers of a gateway for a terminal: no control characters, and nothing that changes the direction of text.
 
 use std::borrow::Cow;
 use std::fmt::Write;
 
 use serde_json::Value;
 
-/// Whether a terminal may act on a character instead of showing it, or show it so that others are misread.
+/// Whether a terminal may interpret a character instead of showing it, or show it in a misleading way.
 fn is_unfit(c: char) -> bool {
     c.is_control()
         || matches!(c,
@@ -13,17 +13,17 @@ fn is_unfit(c: char) -> bool {
             | '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
 }
 
-/// A text on one line, with what is unfit as `\u{1b}`.
+/// A text on one line, with unfit characters escaped as `\u{1b}`.
 pub fn line(text: &str) -> Cow<'_, str> {
     replaced(text, |_| false, |c, out| write!(out, "{}", c.escape_unicode()))
 }
 
-/// A text of several lines; its line ends and tabs stay.
+/// A text of several lines, escaped except for line ends and tabs.
 pub fn lines(text: &str) -> Cow<'_, str> {
     replaced(text, |c| c == '\n' || c == '\t', |c, out| write!(out, "{}", c.escape_unicode()))
 }
 
-/// A document on one line. It is still JSON: what is unfit can only be in its strings.
+/// A document on one line. It is still JSON: only its strings can contain unfit characters.
 pub fn json(document: &Value) -> String {
     let text = document.to_string();
     let escape = |c: char, out: &mut String| {
@@ -54,7 +54,7 @@ fn replaced(
     Cow::Owned(out)
 }
 
-/// Places that a text takes on a terminal: two for a Chinese, Japanese or Korean character.
+/// The columns that a text takes on a terminal: two for a Chinese, Japanese or Korean character.
 pub(crate) fn width(text: &str) -> usize {
     let is_wide = |c: char| {
         matches!(c, '\u{1100}'..='\u{115f}' | '\u{2e80}'..='\u{303e}' | '\u{3041}'..='\u{a4cf}'

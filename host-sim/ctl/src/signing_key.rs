@@ -1,4 +1,4 @@
-//! Files with the keys that firmware is signed with: 64 hexadecimal digits each. The private one is its owner's alone.
+//! Files with the keys for signing firmware: 64 hexadecimal digits each. Only the owner can read the private key.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -12,14 +12,14 @@ use recipe_update::PublicKey;
 use crate::digits::{self, MAX_FILE, exists, write_new, wrong};
 use crate::failure::Failure;
 
-/// A private key. It is not shown, also not for debugging.
+/// A private key. It is never shown, not even in debug output.
 pub(crate) struct Seed(pub(crate) [u8; 32]);
 
-/// Makes a key: the private one in a new file of mode 0600, the public one in another whose name ends in `.pub`.
-/// Returns the digits of the public one, and the name of its file.
+/// Makes a key pair: the private key in a new file of mode 0600, the public key in another file whose name ends in
+/// `.pub`. Returns the digits of the public key, and the name of its file.
 pub fn make(path: &Path) -> Result<(String, PathBuf), Failure> {
     let public_path = beside(path);
-    // Before anything is made: a private key without its public one would have to be deleted by hand.
+    // Checked first: a private key without its public key would have to be deleted by hand.
     if public_path.exists() {
         return Err(exists(&public_path));
     }

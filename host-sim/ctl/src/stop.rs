@@ -1,4 +1,4 @@
-//! The end of what would go on for ever: Ctrl-C, or a time.
+//! Ends a command that would run for ever: by Ctrl-C or a timeout.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -12,12 +12,12 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Without a request.
+    /// A new stop without a request.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// The same, which also stops after `time`.
+    /// The same stop, but also after `time`.
     #[must_use]
     pub fn after(&self, time: Duration) -> Self {
         Self { asked: Arc::clone(&self.asked), at: Instant::now().checked_add(time) }
@@ -28,17 +28,17 @@ impl Stop {
         self.asked.store(true, Relaxed);
     }
 
-    /// Whether it shall end.
+    /// Whether the command is to end.
     pub fn is_asked(&self) -> bool {
         self.was_interrupted() || self.at.is_some_and(|at| Instant::now() >= at)
     }
 
-    /// Whether the end was requested, as opposed to timed out.
+    /// Whether the end was requested, not only the time is over.
     pub fn was_interrupted(&self) -> bool {
         self.asked.load(Relaxed)
     }
 
-    /// Waits; returns early if it is to end, with `true`.
+    /// Waits for `time`; returns true early if the command is to end.
     pub fn wait(&self, time: Duration) -> bool {
         let until = Instant::now() + time;
         loop {
@@ -51,5 +51,5 @@ impl Stop {
     }
 }
 
-/// How often a wait looks whether it shall end.
+/// Interval at which a wait checks for the end.
 pub(crate) const LOOK: Duration = Duration::from_millis(50);

@@ -1,6 +1,6 @@
-//! Tables and words as text for people: aligned columns, names as they are, colours only for what is wrong or well.
+//! Tables and facts as text for people: aligned columns, unchanged names, colours only for good and bad states.
 //!
-//! Colours are ANSI sequences, which the program takes out where nobody sees them.
+//! Colours are ANSI sequences, which the program removes if the output is not a terminal.
 
 use std::fmt::Write;
 
@@ -11,9 +11,9 @@ use crate::shown;
 /// How text is laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TableView {
-    /// Places in a line; `None` if lines may have any length.
+    /// Columns of a line; `None` if lines may have any length.
     pub width: Option<usize>,
-    /// Whether what is watched replaces what was there before.
+    /// Whether watched output replaces the previous output.
     pub is_terminal: bool,
 }
 
@@ -30,7 +30,7 @@ pub(crate) enum Look {
 pub(crate) struct TableCell {
     text: String,
     look: Look,
-    /// At the right end of its column, as numbers are.
+    /// Right-aligned, as numbers are.
     is_number: bool,
 }
 
@@ -90,7 +90,7 @@ impl TextTable {
             self.rows.iter().filter_map(|row| row.get(column)).map(|cell| shown::width(&cell.text)).max()
         };
         let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
-        // A heading stands as its column does.
+        // A heading is aligned like its column.
         let numbers: Vec<bool> = (0..columns)
             .map(|column| {
                 self.rows.iter().skip(1).filter_map(|row| row.get(column)).any(|cell| cell.is_number)

@@ -1,4 +1,4 @@
-//! `trace`: frames as they come and go, by name.
+//! `trace`: frames by name as they are sent and received.
 
 use std::io::Write;
 use std::path::Path;
@@ -13,18 +13,18 @@ use crate::failure::Failure;
 use crate::frames::{FrameDocument, FramesDocument};
 use crate::shown;
 
-/// The names of a file's frames, for a gateway that does not send them: a board has no names.
+/// The names of a file's frames, for a board, which has no names.
 #[derive(Debug)]
 pub struct Names(Decoder);
 
 impl Names {
-    /// Those of this gateway file.
+    /// Reads the names of this gateway file.
     pub fn read(path: &Path) -> Result<Self, Failure> {
         Ok(Self(Decoder::new(&Model::load(path, &[])?)))
     }
 }
 
-/// Prints frames of one port or of all until Ctrl-C. With `json` each frame as a document on a line.
+/// Prints frames of one port or of all ports until Ctrl-C. With `json`, prints one document per line.
 pub fn trace(
     client: &Client,
     port: Option<&str>,
@@ -80,13 +80,14 @@ pub fn trace(
 }
 
 fn decode(names: &Names, frame: &FrameDocument) -> Option<(String, Value)> {
-    // The decoder goes by the port's name.
+    // The decoder only uses the port's name.
     let tapped = frame.frame(PortId(0))?;
     let (topic, values) = names.0.decode(&frame.port, &tapped)?;
     Some((topic.name.clone(), values))
 }
 
-/// The path of the stream with frames. Only a name that stands for itself in a path is sent; others are chosen here.
+/// The path of the stream with frames. It only contains a port name that needs no escaping; other ports are filtered
+/// here.
 pub(crate) fn path(port: Option<&str>) -> String {
     match port.filter(|port| is_plain(port)) {
         Some(port) => format!("stream?frames=1&port={port}"),
@@ -94,7 +95,7 @@ pub(crate) fn path(port: Option<&str>) -> String {
     }
 }
 
-/// Whether a name stands for itself in a path.
+/// Whether a name needs no escaping in a path.
 pub(crate) fn is_plain(name: &str) -> bool {
     name.chars().all(|c| c.is_ascii_alphanumeric() || "-._~".contains(c))
 }

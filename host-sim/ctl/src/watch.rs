@@ -1,4 +1,4 @@
-//! `--watch`: state or variables as the gateway's stream brings them, until somebody presses Ctrl-C.
+//! `--watch`: prints state or variables from the gateway's stream until Ctrl-C.
 
 use std::io::Write;
 
@@ -10,17 +10,17 @@ use crate::failure::Failure;
 use crate::reading::{status_of, values_of};
 use crate::table::TableView;
 
-/// What is watched.
+/// The watched data.
 #[derive(Debug, Clone)]
 pub enum Watched {
     /// State, ports, links.
     Status,
-    /// Variables with one of these in their names.
+    /// Variables whose names contain one of these.
     Values(Vec<String>),
 }
 
-/// Prints what the stream brings: on a terminal in place of what was there, elsewhere one after the other. With
-/// `json` one document a line.
+/// Prints the data of the stream: on a terminal in place of the previous data, elsewhere one after the other. With
+/// `json`, prints one document per line.
 pub fn watch(
     client: &Client,
     what: &Watched,
@@ -52,7 +52,7 @@ fn print(answer: &Answer, json: bool, view: TableView, out: &mut dyn Write) -> R
     if json {
         out.write_all(answer.json().as_bytes())?;
     } else if view.is_terminal {
-        // To the upper left corner; what is there is overwritten, and what is left of it erased.
+        // Moves to the upper left corner, overwrites the old text and erases the rest.
         let text = answer.text(view).replace('\n', "\x1b[K\n");
         write!(out, "\x1b[H{text}\x1b[J")?;
     } else {
@@ -62,7 +62,7 @@ fn print(answer: &Answer, json: bool, view: TableView, out: &mut dyn Write) -> R
     Ok(())
 }
 
-/// Empties a terminal before something is watched on it.
+/// Clears a terminal before data is watched on it.
 pub fn clear(view: TableView, out: &mut dyn Write) -> Result<(), Failure> {
     if view.is_terminal {
         write!(out, "\x1b[2J")?;

@@ -1,10 +1,10 @@
-//! The body of a response, without what is around it.
+//! The body of a response without its framing.
 //!
-//! In: the bytes behind the head, in any pieces. Out: those of the body, and whether it has ended.
+//! In: the bytes after the head, in pieces of any size. Out: the bytes of the body, and whether it has ended.
 
 use super::head::Framing;
 
-/// Takes a body out of the bytes of a connection.
+/// Extracts a body from the bytes of a connection.
 #[derive(Debug)]
 pub(crate) struct Unframer(BodyState);
 
@@ -12,17 +12,17 @@ pub(crate) struct Unframer(BodyState);
 enum BodyState {
     Length(u64),
     Close,
-    /// The line before a chunk, as far as it has come.
+    /// The received part of the line before a chunk.
     Size(Vec<u8>),
     Chunk(u64),
-    /// The line end behind a chunk, and what has come of it.
+    /// The received part of the line end after a chunk.
     ChunkEnd(Vec<u8>),
-    /// The lines behind the last chunk: length of the present one, and of all together.
+    /// The lines after the last chunk: length of the present line, and of all lines.
     Trailer(usize, usize),
     Ended,
 }
 
-/// The bytes are no body as announced.
+/// The bytes do not match the announced framing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct BrokenBody;
 
@@ -36,12 +36,12 @@ impl Unframer {
         })
     }
 
-    /// Whether all of it has come.
+    /// Whether the whole body has been received.
     pub(crate) fn has_ended(&self) -> bool {
         self.0 == BodyState::Ended
     }
 
-    /// Whether it may end here because the connection was closed.
+    /// Whether the body may end here because the connection was closed.
     pub(crate) fn may_end(&self) -> bool {
         matches!(self.0, BodyState::Ended | BodyState::Close)
     }

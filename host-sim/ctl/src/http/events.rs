@@ -1,6 +1,6 @@
 //! Server-sent events.
 //!
-//! In: the bytes of a stream, in any pieces. Out: events. One that is longer than [`MAX_EVENT`] ends the stream.
+//! In: the bytes of a stream, in pieces of any size. Out: events. An event longer than [`MAX_EVENT`] ends the stream.
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ServerEvent {
@@ -8,26 +8,26 @@ pub(crate) struct ServerEvent {
     pub(crate) data: String,
 }
 
-/// Maximum length of an event in bytes, with everything around it.
+/// Maximum length of an event in bytes, including its framing.
 pub(crate) const MAX_EVENT: usize = 1 << 20;
 
 #[derive(Debug, Default)]
 pub(crate) struct EventParser {
     line: Vec<u8>,
-    /// The line before ended with CR: a LF belongs to its end.
+    /// The previous line ended with CR: a following LF belongs to its end.
     after_cr: bool,
     name: String,
     data: Option<String>,
-    /// Bytes since the last event.
+    /// Number of bytes since the last event.
     len: usize,
 }
 
-/// An event is too long, or is no text.
+/// An event is too long or is not text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct BrokenStream;
 
 impl EventParser {
-    /// Takes bytes, and appends the events that end in them.
+    /// Consumes bytes, and appends the events that end in them.
     pub(crate) fn push(&mut self, bytes: &[u8], events: &mut Vec<ServerEvent>) -> Result<(), BrokenStream> {
         for &byte in bytes {
             let after_cr = std::mem::replace(&mut self.after_cr, byte == b'\r');

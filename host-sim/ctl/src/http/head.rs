@@ -1,13 +1,12 @@
 //! The head of a response of HTTP/1.1.
 //!
-//! In: the bytes that have come. Out: the status, fields, and how the body ends. What can be read in two ways is
-//! refused.
+//! In: received bytes. Out: the status, fields, and how the body ends. Refuses ambiguous heads.
 
 use std::fmt;
 
 /// Maximum length of a head in bytes.
 pub(crate) const MAX_HEAD: usize = 16 << 10;
-/// Maximum number of its fields.
+/// Maximum number of fields of a head.
 const MAX_FIELDS: usize = 100;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -16,24 +15,24 @@ pub(crate) struct HttpHead {
     fields: Vec<(String, String)>,
 }
 
-/// How the end of a body is known.
+/// How the end of a body is found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Framing {
-    /// It has this many bytes.
+    /// The body has this many bytes.
     Length(u64),
-    /// It comes in chunks.
+    /// The body is sent in chunks.
     Chunked,
-    /// Until the connection is closed.
+    /// The body ends when the connection is closed.
     Close,
 }
 
-/// Why bytes are no head.
+/// Why bytes are not a head.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum HeadError {
     Incomplete,
-    /// It is longer than [`MAX_HEAD`].
+    /// The head is longer than [`MAX_HEAD`].
     TooLong,
-    /// It is not one of HTTP/1.1, or can be read in two ways.
+    /// The bytes are not HTTP/1.1, or are ambiguous.
     Malformed,
 }
 
@@ -87,7 +86,7 @@ impl HttpHead {
         Some(Self { status, fields })
     }
 
-    /// The value of a field with this lower-case name; `None` if it is not there, or not once.
+    /// The value of a field with this lower-case name; `None` if it is absent or repeated.
     pub(crate) fn field(&self, name: &str) -> Option<&str> {
         let mut values = self.values(name);
         let value = values.next()?;
@@ -100,7 +99,7 @@ impl HttpHead {
 
     pub(crate) fn framing(&self) -> Result<Framing, HeadError> {
         if self.status < 200 {
-            // Too many that only announce another one.
+            // Too many interim responses.
             return Err(HeadError::Malformed);
         }
         if matches!(self.status, 204 | 304) {

@@ -1,11 +1,11 @@
 //! One request over one connection, and its answer.
 //!
-//! In: a request, limits, a time. Out: a head and a body, or why there is none. A server's answer is input like any
-//! other: its head, its body and its events have limits, and all of an answer has a time.
+//! In: a request, limits, a timeout. Out: a head and a body, or why there is none. A server's answer is untrusted
+//! input: its head, body and events are limited, and the whole answer has a timeout.
 //!
-//! No library does it: those that are small enough read a body to its end or not at all, none lets a stream end when
-//! somebody presses Ctrl-C, and following a redirect would carry a signature elsewhere. The server closes the
-//! connection behind each answer, so there is nothing to keep.
+//! No library is used: small ones read a body to its end or not at all, none lets Ctrl-C end a stream, and following a
+//! redirect would carry a signature to another server. The server closes the connection after each answer, so no
+//! connection is kept.
 
 mod body;
 mod events;
@@ -25,13 +25,13 @@ pub(crate) use events::ServerEvent;
 /// Maximum length of a body that is read as a whole.
 const MAX_BODY: usize = 1 << 20;
 
-/// Maximum number of heads before the real one.
+/// Maximum number of interim responses.
 const MAX_ANNOUNCED: usize = 8;
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HttpRequest<'a> {
     pub(crate) method: &'static str,
-    /// The address that the server knows itself by; `None` if it is that of the connection.
+    /// The address that the server knows itself by; `None`: the address of the connection.
     pub(crate) host: Option<&'a str>,
     pub(crate) target: &'a str,
     /// Lines of the head, each with a name and a value.
@@ -62,7 +62,7 @@ pub(crate) enum NoReply {
     /// No connection was made; nothing was sent.
     Unreached(io::Error),
     Reset(String),
-    /// It ended, or took too long, or is none.
+    /// The connection ended, a timeout expired, or the answer is malformed.
     Broken(String),
     Stopped,
 }
@@ -71,7 +71,7 @@ pub(crate) enum NoReply {
 #[derive(Debug)]
 pub(crate) struct HttpExchange {
     stream: TcpStream,
-    /// The end of the time for the head, and for a body that is read as a whole.
+    /// The deadline for the head, and for a body that is read as a whole.
     deadline: Instant,
     timeout: Duration,
     rest: Vec<u8>,
@@ -92,13 +92,13 @@ impl HttpExchange {
         stream.set_nodelay(true).map_err(NoReply::Unreached)?;
         let broken = |error: io::Error| NoReply::Broken(words(&error));
         stream.set_write_timeout(Some(timeout)).map_err(broken)?;
-        // It may be refused before its end: then the answer says why.
+        // The server may refuse the request before its end; the answer then says why.
         let sent = stream.write_all(&text_of(place, request));
         let mut bytes = Vec::new();
         let mut announced = 0;
         let mut exchange = |bytes: &mut Vec<u8>| loop {
             match HttpHead::parse(bytes) {
-                // It announces the real one.
+                // An interim response.
                 Ok((head, len)) if head.status < 200 && announced < MAX_ANNOUNCED => {
                     announced += 1;
                     drop(bytes.drain(..len));
@@ -133,7 +133,7 @@ impl HttpExchange {
         self.head.field(name)
     }
 
-    /// Reads the whole body, within the time of the request.
+    /// Reads the whole body within the timeout of the request.
     pub(crate) fn finish(mut self) -> Result<HttpReply, NoReply> {
         let (mut unframer, mut body) = (self.unframer()?, Vec::new());
         let too_long = || NoReply::Broken(format!("the answer is longer than {MAX_BODY} bytes"));
@@ -177,13 +177,12 @@ pub(crate) struct Stream {
     unframer: Unframer,
     events: EventParser,
     rest: Vec<u8>,
-    /// Events that have come, the newest first.
+    /// Received events, the newest first.
     found: Vec<ServerEvent>,
 }
 
 impl Stream {
-    /// The next bytes of the body; `None` at its end. Silence for longer than the time of a request ends it with
-    /// an error.
+    /// The next bytes of the body; `None` at its end. Silence for longer than the timeout of a request is an error.
     pub(crate) fn bytes(&mut self) -> Result<Option<Vec<u8>>, NoReply> {
         let mut out = Vec::new();
         loop {
@@ -221,7 +220,7 @@ impl Stream {
     }
 }
 
-/// Reads what there is, at least a byte; 0 at the end of the connection.
+/// Reads at least one byte; 0 at the end of the connection.
 fn receive(
     stream: &mut TcpStream,
     bytes: &mut Vec<u8>,
@@ -259,7 +258,7 @@ fn is_wait(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted)
 }
 
-/// An error of the system without its number.
+/// The text of a system error without its number.
 pub(crate) fn words(error: &io::Error) -> String {
     let text = error.to_string();
     match text.split_once(" (os error") {
@@ -269,11 +268,11 @@ pub(crate) fn words(error: &io::Error) -> String {
 }
 
 fn text_of(place: SocketAddr, request: &HttpRequest<'_>) -> Vec<u8> {
-    // The address, not the name: a gateway has no name of its own, and answers only for what it is.
+    // The address, not the name: a gateway has no name of its own and only answers for its address.
     let host = match (request.host, place) {
         (Some(host), _) => host.to_owned(),
         (None, SocketAddr::V4(place)) => place.to_string(),
-        // Without the interface of a link-local one, which only this machine knows.
+        // Without the interface of a link-local address, which only this machine knows.
         (None, SocketAddr::V6(place)) => format!("[{}]:{}", place.ip(), place.port()),
     };
     let mut text = format!("{} {} HTTP/1.1\r\nHost: {host}\r\n", request.method, request.target);

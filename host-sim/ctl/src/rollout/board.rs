@@ -28,7 +28,7 @@ pub fn version_of(update: &Update) -> Result<String, Failure> {
     version.ok_or_else(|| Failure::wrong("the update contains no firmware"))
 }
 
-/// The gateways of an inventory as boards that get this update, each with its name.
+/// The gateways of an inventory as boards for this update, with their names.
 pub fn real_boards<'a>(
     members: &'a [Member],
     update: &'a Update,
@@ -45,7 +45,7 @@ pub fn real_boards<'a>(
 }
 
 impl Real<'_> {
-    /// A client that nobody stops: a board that has begun is brought to its end.
+    /// A client without a stop request: a board that has begun is brought to its end.
     fn client(&self) -> Result<Client, Failure> {
         self.member.client(self.timeout, Stop::new())
     }

@@ -1,8 +1,8 @@
 //! A firmware for many boards: batch by batch, each board judged by its health before and after.
 //!
-//! In: boards behind [`RolloutBoard`], a [`RolloutPlan`]. Out: a [`RolloutReport`] with what became of each board, and steps as they are
-//! done. Knows no network and no clock: a board waits for itself. Keeps no state: the boards say what they run, so the
-//! same rollout, begun again, goes on where the one before has ended.
+//! In: boards behind [`RolloutBoard`], a [`RolloutPlan`]. Out: a [`RolloutReport`] with the outcome of each board, and
+//! completed steps. Does not know networks or clocks: a board waits for itself. Keeps no state: the boards report what
+//! they run, so an interrupted rollout continues when it is started again.
 
 mod board;
 mod report;
@@ -18,81 +18,82 @@ use crate::update::Health;
 pub use board::{Real, real_boards, version_of};
 pub use report::RolloutReport;
 
-/// One board of a rollout. Each step returns once it is done, or has failed for good.
+/// One board of a rollout. Each step returns once it is done or has failed permanently.
 pub trait RolloutBoard: Sync {
-    /// What it runs.
+    /// What the board runs.
     ///
     /// # Errors
-    /// It is not reached, or is no board that takes this firmware.
+    /// The board is not reached, or does not take this firmware.
     fn inspect(&self) -> Result<BoardInfo, Failure>;
-    /// How it does.
+    /// The board's health.
     fn health(&self) -> Result<Health, Failure>;
-    /// Sends the firmware, or what is missing of it. What runs stays.
+    /// Sends the firmware, or its missing part. The running firmware continues.
     ///
     /// # Errors
-    /// It is refused, or the board not reached for long.
+    /// The firmware is refused, or the board is not reached for long.
     fn push(&self) -> Result<(), Failure>;
-    /// Runs it on trial: returns once the board is back with it.
+    /// Starts the trial: returns once the board is back with the firmware.
     ///
     /// # Errors
-    /// It is refused, or the board does not come back with it.
+    /// The trial is refused, or the board does not come back with the firmware.
     fn begin(&self) -> Result<(), Failure>;
     /// Confirms the firmware on trial.
     fn confirm(&self) -> Result<(), Failure>;
-    /// Takes back what is on trial: returns once the board runs the firmware before.
+    /// Ends the trial: returns once the board runs the previous firmware.
     ///
     /// # Errors
-    /// It is refused, or the board does not come back.
+    /// The request is refused, or the board does not come back.
     fn back(&self) -> Result<(), Failure>;
-    /// Time since any instant before the rollout.
+    /// Time since some instant before the rollout.
     fn now(&self) -> Duration;
     /// Waits.
     fn wait(&self, time: Duration);
 }
 
-/// What a board runs, compared with the firmware of the rollout.
+/// What a board runs in comparison with the firmware of the rollout.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BoardInfo {
     /// The version that runs.
     pub version: String,
-    /// What is to be done about it.
+    /// What remains to be done.
     pub state: BoardState,
 }
 
-/// How far a board is.
+/// How far a board is in the rollout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BoardState {
-    /// It runs another firmware.
+    /// The board runs another firmware.
     Other,
-    /// It runs this one on trial.
+    /// The board runs this firmware on trial.
     OnTrial,
-    /// It has another firmware on trial, from someone else.
+    /// The board has another firmware on trial.
     OtherOnTrial,
-    /// It runs this one, confirmed.
+    /// The board runs this firmware, confirmed.
     Confirmed,
 }
 
 /// How a rollout goes through the boards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RolloutPlan {
-    /// So many at a time, at most [`MAX_AT_ONCE`](crate::MAX_AT_ONCE) of them side by side; the next ones begin once these have ended.
+    /// Boards in a batch, at most [`MAX_AT_ONCE`](crate::MAX_AT_ONCE) of them at the same time; the next batch begins
+    /// once this one has ended.
     pub batch: usize,
     /// Begin no further batch once a board has failed.
     pub stop_on_failure: bool,
-    /// How long a board on trial may take until it does as well as before.
+    /// How long a board on trial may take to be as healthy as before.
     pub patience: Duration,
-    /// A board does as well once it has for so long without a break.
+    /// How long a board must be as healthy as before without a break.
     pub settled: Duration,
 }
 
-/// What became of a board.
+/// The outcome of a board.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum BoardOutcome {
     /// Not started: another board has failed, or the end was requested.
     NotBegun,
-    /// It has run this firmware before.
+    /// The board already ran this firmware.
     Already,
-    /// It runs this firmware, confirmed, and does as well as before.
+    /// The board runs this firmware, confirmed, and is as healthy as before.
     Updated,
     /// A step has failed.
     Failed {
@@ -108,11 +109,11 @@ pub enum BoardOutcome {
 /// What a board runs after a failure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Left {
-    /// The firmware before.
+    /// The previous firmware.
     Before,
-    /// The new one, on trial: the board takes it back itself when its time is over.
+    /// The new firmware on trial, which the board takes back itself when the time is over.
     OnTrial,
-    /// The new one.
+    /// The new firmware.
     New,
     /// The board did not say.
     Unknown,
@@ -121,34 +122,34 @@ pub enum Left {
 /// A step of a board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RolloutStep {
-    /// It is asked what it runs.
+    /// The board is asked what it runs.
     Inspect,
     /// The firmware is sent.
     Push,
-    /// It begins to run on trial.
+    /// The trial is started.
     Begin,
-    /// Its health is compared with that before.
+    /// The health is compared with that before.
     Health,
-    /// It is confirmed.
+    /// The firmware is confirmed.
     Confirm,
 }
 
-/// A board and what became of it.
+/// A board and its outcome.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RolloutEntry {
     /// Its name.
     pub name: String,
-    /// The version that ran before, if it has said.
+    /// The version before, if the board has reported it.
     pub was: Option<String>,
-    /// How it did before.
+    /// The health before.
     pub before: Option<Health>,
-    /// How it did last.
+    /// The newest health.
     pub after: Option<Health>,
-    /// What became of it.
+    /// The outcome.
     pub outcome: BoardOutcome,
 }
 
-/// Something that has happened.
+/// Progress of a rollout.
 #[derive(Debug, Clone, Copy)]
 pub enum RolloutEvent<'a> {
     /// A step of a board begins.
@@ -159,8 +160,8 @@ pub enum RolloutEvent<'a> {
     Batch(&'a RolloutReport),
 }
 
-/// Takes the firmware of this version to all boards. Once `stop` is asked, boards that have begun are brought to their
-/// end and no further one begins.
+/// Takes the firmware of this version to all boards. Once `stop` is requested, boards that have begun are brought to
+/// their end and no further board begins.
 pub fn roll_out<B: RolloutBoard>(
     version: &str,
     boards: &[(String, B)],
@@ -218,7 +219,7 @@ fn run_board<B: RolloutBoard>(
             let why = Failure::refused("another firmware is on trial; confirm it or take it back first");
             return failed(RolloutStep::Inspect, &why, Left::Unknown);
         }
-        // A rollout before has ended there; how the board did before is not known any more.
+        // An earlier rollout has ended here; the health before it is unknown.
         BoardState::OnTrial => {}
         BoardState::Other => {
             entry.before = match board.health() {
@@ -232,7 +233,7 @@ fn run_board<B: RolloutBoard>(
             begins(RolloutStep::Begin);
             if let Err(failure) = board.begin() {
                 match left(board) {
-                    // It took longer than somebody has waited.
+                    // The board took longer than the timeout.
                     Left::OnTrial | Left::New => {}
                     left => return failed(RolloutStep::Begin, &failure, left),
                 }
@@ -242,7 +243,7 @@ fn run_board<B: RolloutBoard>(
     begins(RolloutStep::Health);
     if let Err(why) = recover(board, plan, entry) {
         let failure = Failure::refused(why);
-        // What it confirmed itself stays: nothing is on trial that could be taken back.
+        // A firmware that has confirmed itself stays: there is no trial to take back.
         let left = match board.back() {
             Ok(()) => Left::Before,
             Err(_) => left(board),
@@ -251,7 +252,7 @@ fn run_board<B: RolloutBoard>(
     }
     begins(RolloutStep::Confirm);
     let refused = board.confirm().err();
-    // Also right if the board has confirmed itself meanwhile.
+    // Also correct if the firmware has confirmed itself meanwhile.
     match (board.inspect(), refused) {
         (Ok(BoardInfo { state: BoardState::Confirmed, .. }), _) => BoardOutcome::Updated,
         (seen, Some(failure)) => failed(RolloutStep::Confirm, &failure, left_of(seen)),
@@ -263,7 +264,7 @@ fn run_board<B: RolloutBoard>(
     }
 }
 
-/// Waits until a board does as well as before, for a while without a break.
+/// Waits until a board has been as healthy as before for some time without a break.
 fn recover<B: RolloutBoard>(board: &B, plan: RolloutPlan, entry: &mut RolloutEntry) -> Result<(), String> {
     let begun = board.now();
     let mut well_since = None;
@@ -315,7 +316,7 @@ impl RolloutEntry {
 }
 
 impl RolloutStep {
-    /// In a document.
+    /// The name in a document.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Inspect => "inspect",
@@ -340,7 +341,7 @@ impl fmt::Display for RolloutStep {
 }
 
 impl Left {
-    /// In a document.
+    /// The name in a document.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Before => "before",
@@ -351,7 +352,7 @@ impl Left {
     }
 }
 
-/// The health of a gateway where nothing is wrong.
+/// The health of a gateway without problems.
 const RUNNING: &str = "running";
-/// Time between two looks at a board on trial.
+/// Poll interval of a board on trial.
 const LOOK: Duration = Duration::from_secs(1);

@@ -1,4 +1,4 @@
-//! What became of a rollout: a table for people, a document for programs, and where to go on.
+//! The report of a rollout: a table for people, a document for programs, and how to continue.
 
 use std::collections::BTreeMap;
 
@@ -9,19 +9,19 @@ use crate::failure::{Failure, Verdict};
 use crate::table::{Look, TableCell, TableView, TextTable};
 use crate::update::Health;
 
-/// What became of a rollout.
+/// The result of a rollout.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RolloutReport {
     /// The version of the firmware.
     pub version: String,
     /// The boards in the order of the inventory.
     pub entries: Vec<RolloutEntry>,
-    /// Somebody has asked to end.
+    /// Whether the end was requested.
     pub was_stopped: bool,
 }
 
 impl RolloutReport {
-    /// That of a rollout that has not begun.
+    /// The report of a rollout that has not begun.
     pub fn before<'a>(version: &str, names: impl Iterator<Item = &'a str>) -> Self {
         Self {
             version: version.to_owned(),
@@ -30,7 +30,7 @@ impl RolloutReport {
         }
     }
 
-    /// A line of what became of one board.
+    /// One line with the outcome of a board.
     pub fn line(entry: &RolloutEntry) -> String {
         format!("{}: {}", crate::shown::line(&entry.name), crate::shown::line(&entry.outcome.words().0))
     }
@@ -60,7 +60,7 @@ impl RolloutReport {
         table.show(view)
     }
 
-    /// How many boards there are of which outcome, and where to go on.
+    /// The number of boards of each outcome, and how to continue.
     pub fn summary(&self) -> String {
         let count = |wanted: &str| self.entries.iter().filter(|entry| entry.outcome.name() == wanted).count();
         let (updated, already, failed) = (count("updated"), count("already"), count("failed"));
@@ -83,7 +83,7 @@ impl RolloutReport {
         text
     }
 
-    /// As a document.
+    /// The report as a document.
     pub fn document(&self) -> Value {
         let health = |health: &Option<Health>| match health {
             Some(health) => {
@@ -118,10 +118,10 @@ impl RolloutReport {
         })
     }
 
-    /// What the exit code says: well if all boards run the firmware.
+    /// The verdict for the exit code: well if all boards run the firmware.
     ///
     /// # Errors
-    /// The summary if one does not.
+    /// The summary if a board does not run it.
     pub fn verdict(&self) -> Result<Verdict, Failure> {
         let is_there =
             |entry: &RolloutEntry| matches!(entry.outcome, BoardOutcome::Updated | BoardOutcome::Already);
@@ -133,7 +133,7 @@ impl RolloutReport {
 }
 
 impl BoardOutcome {
-    /// In a document.
+    /// The name in a document.
     pub const fn name(&self) -> &'static str {
         match self {
             Self::NotBegun => "not_begun",

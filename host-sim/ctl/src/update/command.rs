@@ -1,4 +1,4 @@
-//! `ctl update` for one board, with what it says to people.
+//! `ctl update` for one board, with its messages.
 
 use std::time::{Duration, Instant};
 
@@ -12,21 +12,21 @@ use crate::client::Client;
 use crate::failure::Failure;
 use crate::firmware::Update;
 
-/// What is done with an update file.
+/// What to do with an update file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Plan {
-    /// Put it on trial, for so many seconds.
+    /// Put it on trial for this many seconds.
     pub trial_s: Option<u32>,
-    /// Confirm it once the board does as well as before.
+    /// Confirm it once the board is as healthy as before.
     pub confirm: bool,
-    /// Whether it may be older than what runs.
+    /// Whether it may be older than the running firmware.
     pub downgrade: Downgrade,
 }
 
-/// `update FILE`: all that the plan says, for one board.
+/// `update FILE`: the whole plan for one board.
 ///
 /// # Errors
-/// A step is refused, or its end is not seen in time.
+/// A step is refused, or does not end in time.
 pub fn update(
     client: &Client,
     file: &Update,
@@ -44,7 +44,7 @@ pub fn update(
     let mut shown = String::new();
     let mut progress = |step: UpdateProgress| {
         let line = step.words();
-        // A line says something new.
+        // Print only lines that change.
         if line != shown {
             notify(&line);
             shown = line;
@@ -80,7 +80,7 @@ pub fn update(
     Ok(answer(kept, format!("{new} runs and is confirmed\n{compared}")))
 }
 
-/// The board on trial and how it does: at once, or once it does as well as before.
+/// The board on trial and its health: at once, or once it is as healthy as before.
 fn settled(
     client: &Client,
     before: &Health,
@@ -110,7 +110,7 @@ fn settled(
     }
 }
 
-/// `update` without a file: what the board says, after confirming or taking back if that is asked for.
+/// `update` without a file: the state of the board.
 pub fn shown(client: &Client) -> Result<Answer, Failure> {
     let firmware = Firmware::of(client)?;
     let text = firmware.text();
@@ -127,7 +127,7 @@ pub fn confirmed(client: &Client) -> Result<Answer, Failure> {
 /// `update --back`.
 ///
 /// # Errors
-/// It is refused, or the board does not come back in time.
+/// The request is refused, or the board does not come back in time.
 pub fn taken_back(client: &Client, notify: &mut dyn FnMut(&str)) -> Result<Answer, Failure> {
     let firmware = take_back(client, &mut |step| notify(&step.words()))?;
     let text = firmware.text();

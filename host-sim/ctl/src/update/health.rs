@@ -1,4 +1,4 @@
-//! How a board does, to compare before with after.
+//! The health of a board, to compare before with after.
 
 use std::fmt;
 
@@ -6,19 +6,19 @@ use crate::client::Client;
 use crate::failure::Failure;
 use crate::shown;
 
-/// How a board does.
+/// The health of a board.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Health {
-    /// In one word, as in `status`: `running` if nothing is wrong.
+    /// One word, as in `status`: `running` if nothing is wrong.
     pub word: String,
-    /// Links to the controller that are up.
+    /// Number of links to the controller that are up.
     pub links_up: u64,
-    /// Field ports that work.
+    /// Number of working field ports.
     pub ports_working: u64,
 }
 
 impl Health {
-    /// Whether it is at least as good as it was.
+    /// Whether it is at least as good as `before`.
     pub fn is_as_good_as(&self, before: &Self) -> bool {
         self.links_up >= before.links_up && self.ports_working >= before.ports_working
     }
@@ -31,7 +31,7 @@ impl fmt::Display for Health {
     }
 }
 
-/// How the board does.
+/// Reads the health of the board.
 pub fn health(client: &Client) -> Result<Health, Failure> {
     let status = client.json("status")?;
     let count = |list: &str, is_well: &dyn Fn(&str) -> bool| {

@@ -1,7 +1,7 @@
-//! The firmware of a board: what it says of it (docs/api.md section 9, docs/update.md).
+//! The firmware of a board (docs/api.md section 9, docs/update.md).
 //!
-//! In: a board's client. Out: what the board says, as [`Firmware`], and whether that is the firmware of a file. The
-//! steps of an update are in `steps`, all of one for one board in `command`.
+//! In: a board's client. Out: the state that the board reports, as [`Firmware`], and whether that is the firmware of a
+//! file. The steps of an update are in `steps`, a whole update of one board in `command`.
 
 mod command;
 mod health;
@@ -20,27 +20,27 @@ pub use command::{Plan, confirmed, shown, taken_back, update};
 pub use health::{Health, health};
 pub use steps::{UpdateProgress, begin_trial, confirm, fitting, push, take_back, wait_confirmed};
 
-/// What a board says of its firmware: the document `update`.
+/// The state of a board's firmware: the document `update`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Firmware {
-    /// Its board, such as `nucleo-h743zi`.
+    /// The board's name, such as `nucleo-h743zi`.
     pub board: String,
     /// The version that runs.
     pub version: String,
-    /// The first digits of the SHA-512 of what runs, which tell builds of one version apart; `None` if the board does
-    /// not say it.
+    /// The first digits of the SHA-512 of the running firmware, which distinguish builds of one version; `None` if the
+    /// board does not report them.
     pub sha512: Option<String>,
-    /// The slot it runs in; `None` if it takes no updates.
+    /// The running slot; `None` if the board takes no updates.
     pub slot: Option<Slot>,
-    /// Why it takes no update.
+    /// Why the board takes no update.
     pub cannot: Option<String>,
-    /// The key that its loader takes firmware of.
+    /// The key that the board's loader accepts.
     pub key: Option<PublicKey>,
-    /// What runs is on trial.
+    /// The trial of the running firmware.
     pub trial: Option<UpdateTrial>,
-    /// What is being received, or was.
+    /// The newest firmware that is being received or was received.
     pub incoming: Option<Incoming>,
-    /// The newest trial that has ended: its slot, and how.
+    /// The slot and the result of the newest ended trial.
     pub last: Option<(Slot, String)>,
     /// The document itself.
     pub document: Value,
@@ -49,9 +49,9 @@ pub struct Firmware {
 /// A firmware that runs on trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UpdateTrial {
-    /// Seconds until it is taken back.
+    /// Seconds until the firmware is taken back.
     pub left_s: f64,
-    /// What is missing until it confirms itself.
+    /// The condition for the firmware to confirm itself.
     pub waits_for: String,
 }
 
@@ -64,26 +64,26 @@ pub struct Incoming {
     pub sha512: String,
     /// Length of header and image in bytes.
     pub length: u64,
-    /// Where the next piece begins.
+    /// The start of the next piece.
     pub received: u64,
-    /// Why it has failed.
+    /// Why the transfer has failed.
     pub why: String,
 }
 
-/// Whether an older firmware than the one that runs is taken.
+/// Whether a firmware older than the running one is accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Downgrade {
     /// The board refuses it.
     Refused,
-    /// Somebody has asked for it.
+    /// The user has allowed it.
     Allowed,
 }
 
 impl Firmware {
-    /// What the board says.
+    /// Reads the state of the board's firmware.
     ///
     /// # Errors
-    /// It is refused, such as by a gateway on a host, or not reached.
+    /// It is refused, such as by a gateway on a host, or the board is not reached.
     pub fn of(client: &Client) -> Result<Self, Failure> {
         Self::read(client, client.json("update")?)
     }
@@ -123,21 +123,21 @@ impl Firmware {
         })
     }
 
-    /// Whether it runs the firmware of this file: the same version, and the same build as far as the board says which
-    /// it is.
+    /// Whether the board runs the firmware of this file: the same version, and the same build as far as the board
+    /// reports it.
     pub fn is_of(&self, update: &Update) -> bool {
         let links = update.links();
         let is_version = links.first().is_some_and(|link| link.header.version().to_string() == self.version);
         is_version && self.is_build_of(update) != Some(false)
     }
 
-    /// Whether what runs is the image of this file for its slot; `None` if the board does not say what it runs, or the
-    /// file has no image for that slot.
+    /// Whether the running firmware is the image of this file for its slot; `None` if the board does not report the
+    /// build, or the file has no image for that slot.
     pub fn is_build_of(&self, update: &Update) -> Option<bool> {
         let said = self.sha512.as_deref()?;
         let link = update.links().into_iter().find(|link| Some(link.header.slot()) == self.slot)?;
         let digits = Hex(&link.header.hash()[..]).to_string();
-        // A board says the first digits, and how many is its affair.
+        // The board chooses how many of the first digits it reports.
         Some(!said.is_empty() && digits.starts_with(said))
     }
 }

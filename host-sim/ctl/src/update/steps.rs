@@ -1,5 +1,4 @@
-//! The steps of an update, each with its end: sent, tried, confirmed, taken back. They can be put together for many
-//! boards.
+//! The steps of an update, each with its end: sent, tried, confirmed, taken back. They can be combined for many boards.
 
 use std::time::{Duration, Instant};
 
@@ -17,28 +16,28 @@ use crate::http::HttpReply;
 pub enum UpdateProgress {
     /// The slot is being erased.
     Erasing,
-    /// So many bytes of so many were taken.
+    /// The board has received this many bytes.
     Sent {
-        /// Bytes that the board has.
+        /// Received bytes.
         received: u64,
-        /// All of them.
+        /// Total number of bytes.
         length: u64,
     },
     /// The board computes the hash.
     Checking,
     /// The board restarts.
     Restarting,
-    /// It runs the firmware on trial, which waits for this until it confirms itself.
+    /// The board runs the firmware on trial; `waits_for` says what is missing until it confirms itself.
     OnTrial(UpdateTrial),
 }
 
 impl UpdateProgress {
-    /// A line for people.
+    /// One line for people.
     pub fn words(&self) -> String {
         match self {
             Self::Erasing => "the slot is being erased".to_owned(),
             Self::Sent { received, length } => {
-                // In tens, so that a line is printed for each of them and not for each piece.
+                // In steps of ten per cent, so a line is not printed for each piece.
                 let tenths = (received * 10).checked_div(*length).unwrap_or(10);
                 format!("sent: {} %", tenths * 10)
             }
@@ -52,8 +51,8 @@ impl UpdateProgress {
 /// The part of an update file that this board takes.
 ///
 /// # Errors
-/// It takes none, or none of this file: another board, no link for its free slot, damaged, or signed with another key
-/// than its loader's.
+/// The board takes no update, or not this file: another board, no image for its free slot, damaged, or not signed with
+/// the key of its loader.
 pub fn fitting<'u>(client: &Client, board: &Firmware, update: &'u Update) -> Result<SlotImage<'u>, Failure> {
     if let Some(why) = &board.cannot {
         return Err(client.refused(why));
@@ -80,11 +79,11 @@ pub fn fitting<'u>(client: &Client, board: &Firmware, update: &'u Update) -> Res
     Ok(link)
 }
 
-/// Sends a firmware into the free slot, or what is missing of it, until the board has computed its hash. Changes
-/// nothing of what runs.
+/// Sends a firmware into the free slot, or its missing part, until the board has computed its hash. The running
+/// firmware is not changed.
 ///
 /// # Errors
-/// It is refused, damaged on the way, or the board was not reached for a minute.
+/// The firmware is refused, damaged in transit, or the board was not reached for a minute.
 pub fn push(
     client: &Client,
     link: &SlotImage<'_>,
@@ -93,7 +92,7 @@ pub fn push(
 ) -> Result<Firmware, Failure> {
     let length = (link.header_bytes.len() + link.image.len()) as u64;
     let mut lost: Option<Instant> = None;
-    // Where the next piece begins; `None` while the board has something else to do.
+    // The start of the next piece; `None` while the board is busy.
     let mut next = Some(0);
     loop {
         let asked = match next {
@@ -107,7 +106,7 @@ pub fn push(
                 if since.elapsed() > AWAY || client.stop().wait(AGAIN) {
                     return Err(failure);
                 }
-                // Whether it was restarted meanwhile is seen by what it says to the header.
+                // The board's reply to the header shows whether it has restarted meanwhile.
                 next = Some(0);
                 continue;
             }
@@ -139,7 +138,7 @@ pub fn push(
     }
 }
 
-/// Sends the piece of a firmware that begins there.
+/// Sends the piece of a firmware that begins at an offset.
 fn put(
     client: &Client,
     link: &SlotImage<'_>,
@@ -159,10 +158,10 @@ fn put(
     client.call(&Call { method: "PUT", body: RequestBody::Image(piece), ..Call::get(&path) })
 }
 
-/// Runs what was received on trial: returns when the board has restarted with it.
+/// Runs the received firmware on trial: returns when the board has restarted with it.
 ///
 /// # Errors
-/// It is refused, or the board does not come back with it in time.
+/// The trial is refused, or the board does not come back with the firmware in time.
 pub fn begin_trial(
     client: &Client,
     confirm_s: u32,
@@ -173,7 +172,7 @@ pub fn begin_trial(
     let path = format!("update/try{}", more(downgrade, '?'));
     post(client, &path, &json!({ "confirm_s": confirm_s }))?;
     progress(UpdateProgress::Restarting);
-    // The trial ends by itself after that, and restarts take their time.
+    // After that time the trial ends by itself; restarts take additional time.
     let there = |now: &Firmware| now.trial.is_some();
     let failed = |now: &Firmware| {
         // Two trials of one slot may end alike. The board reports the received bytes until the restart.
@@ -185,10 +184,10 @@ pub fn begin_trial(
     back(client, RESTARTING, &there, &failed)
 }
 
-/// Waits until the firmware that runs on trial was confirmed, by itself or by somebody.
+/// Waits until the firmware on trial has been confirmed, by itself or by a user.
 ///
 /// # Errors
-/// The trial has ended otherwise.
+/// The trial has ended without confirmation.
 pub fn wait_confirmed(
     client: &Client,
     progress: &mut dyn FnMut(UpdateProgress),
@@ -212,21 +211,21 @@ pub fn wait_confirmed(
         }
         seen = match Firmware::of(client) {
             Ok(seen) => seen,
-            // It restarts, or is on its way back.
+            // The board is restarting.
             Err(_) => back(client, RESTARTING + Duration::from_secs_f64(left), &|_| true, &|_| false)?,
         };
     }
 }
 
-/// Keeps the firmware that is on trial.
+/// Confirms the firmware on trial.
 pub fn confirm(client: &Client) -> Result<Firmware, Failure> {
     post(client, "update/confirm", &json!({}))
 }
 
-/// Takes the firmware on trial back: returns when the board runs the one before.
+/// Takes the firmware on trial back: returns when the board runs the previous one.
 ///
 /// # Errors
-/// It is refused, or the board does not come back in time.
+/// The request is refused, or the board does not come back in time.
 pub fn take_back(client: &Client, progress: &mut dyn FnMut(UpdateProgress)) -> Result<Firmware, Failure> {
     let slot = post(client, "update/back", &json!({}))?.slot;
     progress(UpdateProgress::Restarting);
@@ -237,7 +236,7 @@ fn post(client: &Client, path: &str, arguments: &Value) -> Result<Firmware, Fail
     Firmware::read(client, client.ask(&Call { more_time: REPLACING, ..Call::post(path, arguments) })?)
 }
 
-/// The board, once it is `there` again.
+/// The board, once `there` is true for it.
 fn back(
     client: &Client,
     limit: Duration,
@@ -246,7 +245,7 @@ fn back(
 ) -> Result<Firmware, Failure> {
     let deadline = Instant::now() + limit;
     loop {
-        // Its answer leaves before it restarts.
+        // The board answers before it restarts.
         if client.stop().wait(AGAIN) {
             return Err(
                 client.refused("ended before the board was back; `ctl update` shows what became of it")
@@ -287,12 +286,12 @@ fn more(downgrade: Downgrade, mark: char) -> String {
     }
 }
 
-/// Bytes of an image that are sent at once: as many as a board takes.
+/// Maximum bytes of an image in a request, the most that a board takes.
 const PIECE: usize = 16 << 10;
-/// How long a board may be away while a firmware is sent.
+/// How long a board may be unreachable while a firmware is sent.
 const AWAY: Duration = Duration::from_secs(60);
-/// Time that a board may take to bring its safe values out and check a signature.
+/// Time that a board may take to send its safe values and check a signature.
 const REPLACING: Duration = Duration::from_secs(10);
-/// Time that a board may take to start again: three starts that the watchdog ends, and the one before.
+/// Time that a board may take to restart: three starts that the watchdog ends, and the previous firmware's start.
 const RESTARTING: Duration = Duration::from_secs(60);
 pub(super) const AGAIN: Duration = Duration::from_millis(300);
