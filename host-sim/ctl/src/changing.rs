@@ -181,7 +181,7 @@ pub fn config(client: &Client, revision: Option<u32>) -> Result<Answer, Failure>
 pub struct TrialOptions {
     /// Seconds until it is taken back unless it is confirmed.
     pub confirm_s: f64,
-    /// Another one than the stored one that waits.
+    /// The revision to try; `None`: the stored one that waits.
     pub revision: Option<u32>,
 }
 

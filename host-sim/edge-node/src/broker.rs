@@ -13,7 +13,7 @@ use rustls::{ClientConfig, RootCertStore};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio_rustls::TlsConnector;
 
-/// A broker, and how it is spoken to.
+/// A broker, with or without TLS.
 #[derive(Debug, Clone)]
 pub struct Broker {
     host: String,
@@ -27,16 +27,15 @@ pub(crate) trait BrokerConnection: AsyncRead + AsyncWrite + Unpin {}
 impl<T: AsyncRead + AsyncWrite + Unpin> BrokerConnection for T {}
 
 impl Broker {
-    /// A broker that is spoken to without TLS.
+    /// A broker without TLS.
     pub fn plain(host: impl Into<String>, port: u16) -> Self {
         Self { host: host.into(), port, tls: None }
     }
 
-    /// A broker with TLS 1.2 or 1.3, which proves with a certificate of one of these authorities that it is called
-    /// `host`.
+    /// A broker with TLS 1.2 or 1.3, which must have a certificate for `host` from one of these authorities.
     ///
     /// # Errors
-    /// If the file cannot be read or has no certificates; one message.
+    /// If the file cannot be read or has no certificates, as one message.
     pub fn with_tls(host: impl Into<String>, port: u16, authorities: &Path) -> Result<Self, String> {
         let refused = |why: &dyn std::fmt::Display| format!("{}: {why}", authorities.display());
         let mut roots = RootCertStore::empty();
@@ -58,7 +57,7 @@ impl Broker {
         Ok(Self { host, port, tls: Some(Arc::new(config)) })
     }
 
-    /// Where it is, for people.
+    /// The address, for people.
     pub fn address(&self) -> String {
         format!("{}:{}", self.host, self.port)
     }
@@ -77,7 +76,7 @@ impl Broker {
     }
 }
 
-/// Ends a connection so that what was sent arrives: a socket that is closed while it has something to read is reset.
+/// Ends a connection after sent data has arrived: closing a socket with unread data would reset it.
 pub(crate) async fn close(mut stream: Box<dyn BrokerConnection>) {
     let _ = tokio::time::timeout(CLOSE_TIME, async {
         stream.shutdown().await?;

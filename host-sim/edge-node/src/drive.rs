@@ -1,4 +1,4 @@
-//! The way from an edge node to its broker: everything that the node asks for is done here.
+//! Connects an edge node to its broker and executes its outputs.
 
 use std::io;
 use std::time::{Duration, SystemTime};
@@ -14,34 +14,34 @@ use tokio::time::{Instant as TokioInstant, MissedTickBehavior, interval, sleep_u
 
 use crate::broker::{Broker, BrokerConnection, close};
 
-/// Where values come from.
+/// The source of values.
 pub trait Sampler {
-    /// Puts the present values in their places.
+    /// Writes the present values to their places.
     fn sample(&mut self, node: &NodeCounters, values: &mut [Option<Value>]) -> impl Future<Output = Sampled>;
 }
 
-/// What a sample was.
+/// The result of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sampled {
-    /// The values are there, and these devices work.
+    /// The values were written, and these devices work.
     Alive(u32),
-    /// There are none at the moment.
+    /// There are no values at the moment.
     Nothing,
-    /// There will be others: the node is to die.
+    /// The metrics will change: the node is to die.
     Changed,
 }
 
-/// What a node asks its driver to keep, and tells it.
+/// Stores and reports what a node requests.
 pub trait Listener {
-    /// Keeps the number of the session over restarts.
+    /// Stores the session number, which must survive restarts.
     fn keep(&mut self, bd_seq: u8);
-    /// Births were sent.
+    /// The births were sent.
     fn online(&mut self);
-    /// There is no session, because of this; an error of the connection says more.
+    /// There is no session, for this reason; an error of the connection has details.
     fn failed(&mut self, failure: SessionFailure, error: Option<&io::Error>);
 }
 
-/// Drives a node until it has died, because `end` became true or the sampler ended it.
+/// Drives a node until it has died, because `end` became true or the sampler returned [`Sampled::Changed`].
 pub async fn drive<const METRICS: usize, const HISTORY: usize>(
     node: &mut EdgeNode<METRICS, HISTORY>,
     catalog: &impl Catalog,
@@ -52,14 +52,14 @@ pub async fn drive<const METRICS: usize, const HISTORY: usize>(
     mut end: watch::Receiver<bool>,
 ) {
     let mut ticks = interval(period);
-    // After a pause the next one is a period later: values are of now, not of then.
+    // After a pause, the next tick is a period later: values are sampled now, not for missed ticks.
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let places = (0..=catalog.devices()).map(|nth| match nth.checked_sub(1) {
         None => catalog.metrics(recipe_sparkplug::catalog::Owner::Node),
         Some(device) => catalog.metrics(recipe_sparkplug::catalog::Owner::Device(device as u8)),
     });
     let mut samples = Samples { values: vec![None; places.sum()], misses: 0 };
-    // Births have values and dates from the first one on.
+    // The first births already have values and timestamps.
     samples.take(node, catalog, sampler).await;
     ticks.tick().await;
     let mut driver = SessionDriver { stream: None, error: None, was_online: false, logged: None };
@@ -77,7 +77,7 @@ pub async fn drive<const METRICS: usize, const HISTORY: usize>(
             }
         };
         tokio::pin!(open);
-        // While a connection is being made, samples go on.
+        // Sampling continues while a connection is being made.
         loop {
             let stream = async {
                 match &mut driver.stream {
@@ -125,12 +125,12 @@ pub async fn drive<const METRICS: usize, const HISTORY: usize>(
 
 struct Samples {
     values: Vec<Option<Value>>,
-    /// Samples without values, one after the other.
+    /// Number of consecutive samples without values.
     misses: u32,
 }
 
 impl Samples {
-    /// Gives the node one sample and the time. True if the node is to die.
+    /// Gives the node one sample and the time. Returns true if the node is to die.
     async fn take<const METRICS: usize, const HISTORY: usize>(
         &mut self,
         node: &mut EdgeNode<METRICS, HISTORY>,
@@ -168,8 +168,7 @@ struct SessionDriver {
 }
 
 impl SessionDriver {
-    /// Does what the node asks for until it waits. Returns whether a connection is to be made, and until when it
-    /// waits.
+    /// Executes the node's outputs until it waits. Returns whether to connect, and the end of the wait.
     async fn drain<const METRICS: usize, const HISTORY: usize>(
         &mut self,
         node: &mut EdgeNode<METRICS, HISTORY>,
@@ -181,7 +180,7 @@ impl SessionDriver {
         let until = loop {
             match node.poll_output(now(), catalog, buf) {
                 NodeOutput::Open => is_opening = true,
-                // A host measures a birth at once.
+                // A host builds a birth without interruption.
                 NodeOutput::Busy => {}
                 NodeOutput::Keep { bd_seq } => listener.keep(bd_seq),
                 NodeOutput::Send(bytes) => {
@@ -207,7 +206,7 @@ impl SessionDriver {
                 .unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
         {
             self.lost(node, catalog, Some(error));
-            // The node says what follows.
+            // The node decides what follows.
             return Box::pin(self.drain(node, catalog, buf, listener)).await;
         }
         match (node.is_online(), node.failure()) {
@@ -242,17 +241,17 @@ fn utc_ms() -> Option<u64> {
 
 fn deadline(until: Instant) -> TokioInstant {
     let left = Duration::from_micros(until.saturating_since(now()).as_micros());
-    // A node that waits for nothing is asked again all the same.
+    // A node without a deadline is polled after this time all the same.
     TokioInstant::now() + left.min(LONGEST)
 }
 
-/// Length of a node's pieces, and of what is read at once.
+/// Length of the node's chunks, and of a read.
 const BUFFER: usize = 8_192;
-/// How long the broker may take nothing.
+/// How long the broker may read nothing.
 const WRITE_TIME: Duration = Duration::from_secs(10);
-/// The longest time without looking at a node.
+/// Maximum time between two polls of a node.
 const LONGEST: Duration = Duration::from_secs(3_600);
-/// Samples without values after which they are unknown.
+/// Number of samples without values after which the values are unknown.
 const MAX_MISSES: u32 = 5;
 /// Milliseconds from 1970 to 2024.
 const OF_2024: u64 = 1_704_067_200_000;

@@ -1,4 +1,4 @@
-//! A Sparkplug file, its files, and what a node and its driver need of them.
+//! A Sparkplug file, the files that it names, and the settings of a node and its driver.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -18,9 +18,9 @@ pub struct PublisherConfig {
     pub broker: Broker,
     /// The node's names.
     pub settings: Settings,
-    /// How often the gateway is looked at.
+    /// Sampling interval of the gateway.
     pub sample: Duration,
-    /// Where the number of the session is kept.
+    /// The file of the session number.
     pub bd_seq: Option<PathBuf>,
     rules: Vec<PublishRule>,
     file: SparkplugFile,
@@ -45,7 +45,7 @@ impl PublisherConfig {
         }
         let settings = settings_of(&file).map_err(of_file)?;
         if let Some(kept) = &file.bd_seq {
-            // A mistake shows before anything runs.
+            // Mistakes show before anything runs.
             read_bd_seq(kept).map_err(|why| of_file(format!("node.bd_seq: {why}")))?;
         }
         let rules = file.rules.iter().map(|rule| PublishRule {
@@ -68,7 +68,7 @@ impl PublisherConfig {
     }
 }
 
-/// The names of a file's node, and what its login has.
+/// The names of a file's node, and its login.
 pub(crate) fn settings_of(file: &SparkplugFile) -> Result<Settings, String> {
     let id = |name: &str| Id::new(name).map_err(|error| error.to_string());
     let mut settings = Settings::new(id(&file.group)?, id(&file.node)?);
@@ -86,7 +86,7 @@ pub(crate) fn settings_of(file: &SparkplugFile) -> Result<Settings, String> {
 /// Reads a file with two lines, user and password, that nobody else can read.
 ///
 /// # Errors
-/// What is wrong with it; what is in it is not repeated.
+/// What is wrong with the file, without its contents.
 pub fn read_login(path: &Path) -> Result<(Credential, Credential), String> {
     let refused = |why: &str| format!("{}: {why}", path.display());
     let text = read_private(path, 1_000).map_err(|error| refused(&error.to_string()))?;
@@ -115,7 +115,7 @@ pub fn read_bd_seq(path: &Path) -> Result<Option<u8>, String> {
     }
 }
 
-/// Keeps the number of a session: the file is there whole, before or after.
+/// Stores the number of a session atomically.
 pub fn write_bd_seq(path: &Path, number: u8) -> std::io::Result<()> {
     Beside::file(path, format!("{number}\n").as_bytes())?.0.replace(path)
 }

@@ -1,6 +1,6 @@
-//! Many simulated nodes in one process, for tests of brokers and of whoever reads.
+//! Many simulated nodes in one process, to test brokers and subscribers.
 //!
-//! Each has the metrics of a gateway with two field ports. Some values change with each sample, as those of a cell do.
+//! Each has the metrics of a gateway with two field ports. Some values change with each sample, as in a real cell.
 
 use std::cell::RefCell;
 use std::io;
@@ -18,24 +18,24 @@ use tokio::task::LocalSet;
 use crate::broker::Broker;
 use crate::drive::{Listener, Sampled, Sampler, drive};
 
-/// What is to be simulated.
+/// What to simulate.
 #[derive(Debug, Clone)]
 pub struct Fleet {
-    /// The broker of all.
+    /// The broker of all nodes.
     pub broker: Broker,
     /// Number of nodes.
     pub nodes: usize,
-    /// Their group; the nodes are called `node-1` and so on.
+    /// The group of the nodes, which are called `node-1` and so on.
     pub group: Id,
-    /// User and password of all.
+    /// User and password of all nodes.
     pub login: Option<(Credential, Credential)>,
-    /// How often each takes new values.
+    /// Sampling period of each node.
     pub period: Duration,
-    /// How long.
+    /// Duration of the simulation.
     pub length: Duration,
 }
 
-/// What all nodes together did.
+/// The sums over all nodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Totals {
     /// Nodes that are online.
@@ -44,7 +44,7 @@ pub struct Totals {
     pub sessions: u64,
     /// Births of nodes.
     pub births: u64,
-    /// Those of them that were asked for.
+    /// Births that were requested.
     pub rebirths: u64,
     /// Messages of data.
     pub data: u64,
@@ -56,13 +56,13 @@ pub struct Totals {
     pub failures: u64,
 }
 
-/// A node's memory, without its connection.
+/// Memory of a node without its connection, in bytes.
 pub const NODE_BYTES: usize = size_of::<SimulatedNode>();
 
 type SimulatedNode = EdgeNode<METRICS, 64>;
 
 impl Fleet {
-    /// Runs the nodes, and calls `each_second` with what they have done so far.
+    /// Runs the nodes, and calls `each_second` with the totals so far.
     ///
     /// # Errors
     /// If the runtime cannot be started, or there are too many nodes for their names.
@@ -85,7 +85,7 @@ impl Fleet {
                 let mut sampler = SimulatedSampler { random: seed, step: 0, nth, all: Rc::clone(&all) };
                 let mut listener = Watched { nth, all: Rc::clone(&all) };
                 tasks.spawn_local(async move {
-                    // Not all at the same instant.
+                    // Start the nodes at different instants.
                     let offset = period.mul_f64((seed % 1_000) as f64 / 1_000.0);
                     tokio::time::sleep(offset).await;
                     drive(&mut node, &SimulatedCatalog, &broker, period, &mut sampler, &mut listener, ended)
@@ -148,7 +148,7 @@ impl Sampler for SimulatedSampler {
         for (place, value) in values.iter_mut().enumerate() {
             self.random =
                 self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            // One in four changes.
+            // One value in four changes.
             let is_new = value.is_none() || self.random >> 62 == 0;
             let number = (self.random >> 33) as u32;
             *value = match kind(place) {
