@@ -40,7 +40,6 @@ pub fn changes_since_0_2(config: &GatewayConfig, recipes: &[Option<DeviceRecipe>
     told
 }
 
-/// The changes of one port.
 struct PortChanges<'a> {
     config: &'a GatewayConfig,
     port: &'a Port,

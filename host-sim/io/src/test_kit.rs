@@ -47,7 +47,6 @@ impl PortTask {
         Self::of(OpenPort::open(&bind.parse().unwrap(), bus).await.unwrap())
     }
 
-    /// Runs a port that is open.
     pub(super) fn of(port: OpenPort) -> Self {
         let (place, tx) = (port.place(), port.tx());
         let log = Rc::new(Log::default());

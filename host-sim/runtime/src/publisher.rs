@@ -164,7 +164,6 @@ async fn publish(
 struct SnapshotReader {
     slot: Arc<SnapshotSlot>,
     running: watch::Receiver<Option<RunningGateway>>,
-    /// The buffer of the next snapshot.
     buffer: Option<Box<GatewaySnapshot>>,
 }
 

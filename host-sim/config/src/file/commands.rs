@@ -31,7 +31,6 @@ enum BitKey {
 const BIT_KEYS: [(&str, BitKey); 3] =
     [("rising", BitKey::Rising), ("falling", BitKey::Falling), ("level", BitKey::Level)];
 
-/// Reads the commands of a field.
 pub(super) fn read(field: &TableReader<'_>, commands: &TableValue<'_>) -> Result<FileCommands> {
     let table = commands.any_table()?;
     let keys: Vec<_> = table.entries().filter_map(|(key, ..)| bit_key(key)).collect();

@@ -14,7 +14,6 @@ use super::reader::{Result, TableReader, TableValue};
 use crate::keys::device::{ESCAPE, ESCAPES, FRAMING, FRAMINGS};
 use crate::keys::field::{ALL_COUNTS, COUNTS, PLUS, TEXT_IN, TEXT_ORDER, TEXT_ORDERS, TEXT_OUT, TEXT_WIDTH};
 
-/// The keys of a stream part.
 pub(super) const PART_KEYS: [&str; 2] = ["framing", "escape"];
 /// The keys of a text beyond those of other fields.
 pub(super) const TEXT_KEYS: [&str; 5] = ["length_to", "count_to", "length_from", "order", "ignore"];

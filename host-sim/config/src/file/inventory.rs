@@ -24,7 +24,6 @@ pub struct Listed {
     pub key: Option<PathBuf>,
 }
 
-/// Maximum number of gateways.
 const MAX: usize = 10_000;
 
 /// Reads an inventory. `check` returns what is wrong with an address, and is also called for `host`.

@@ -9,7 +9,6 @@ use super::reader::{Result, Spot, TableReader};
 use crate::keys::Key;
 use crate::keys::frame::{AFTER, FRAME_NAME};
 
-/// The keys of [`FrameOrder`].
 pub(super) const ORDER_KEYS: &[Key] = &[FRAME_NAME, AFTER];
 
 impl FrameOrder {

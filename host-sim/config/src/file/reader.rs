@@ -93,7 +93,6 @@ impl<'a> TableReader<'a> {
         self.spot.error(self.document, message)
     }
 
-    /// The value of `key`, if it is present.
     pub(super) fn optional(&self, key: &str) -> Option<TableValue<'a>> {
         let entry = self.table.get(key)?;
         // An array of tables has no place of its own, only its values have.
@@ -210,7 +209,6 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// The value, if it is a string.
     pub(super) fn as_string(&self) -> Option<&'a str> {
         match &self.node.value {
             TreeValue::Str(text) => Some(text),
@@ -225,7 +223,6 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// The value, if it is a bool.
     pub(super) fn as_bool(&self) -> Option<bool> {
         match self.node.value {
             TreeValue::Bool(value) => Some(value),
@@ -233,7 +230,6 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// The value, if it is an integer.
     pub(super) fn as_integer(&self) -> Option<i64> {
         match self.node.value {
             TreeValue::Int(Ok(value)) => Some(value),
@@ -252,7 +248,6 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// An integer in `range`.
     pub(super) fn integer<T: TryFrom<i64>>(&self, range: RangeInclusive<i64>) -> Result<T> {
         let refused = |shown: &str| {
             Err(self.error(format!("{shown} is out of range; allowed: {}..={}", range.start(), range.end())))
@@ -326,7 +321,6 @@ impl<'a> TableValue<'a> {
         Ok(reader)
     }
 
-    /// A table with any keys.
     pub(super) fn any_table(&self) -> Result<TableReader<'a>> {
         match &self.node.value {
             TreeValue::Table(table) => {
@@ -376,7 +370,6 @@ fn is_number(text: &str) -> bool {
     }
 }
 
-/// Whether the word is valid for the key.
 fn is_word(table: &keys::KeyTable, key: &str, word: &str) -> bool {
     let words = table.common.iter().filter(|known| known.name == key).map(|known| known.shape);
     words.into_iter().any(|shape| matches!(shape, keys::Shape::Words(words) if words().contains(&word)))

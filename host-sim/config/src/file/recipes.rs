@@ -206,7 +206,6 @@ fn read_part(item: &TableValue<'_>, rules: Rules, is_can: bool, flavour: Flavour
 }
 
 impl FilePart {
-    /// Checks that the part fits this framing.
     fn check(&self, rules: Rules, is_can: bool, framing: Framing) -> std::result::Result<(), PartError> {
         let fields = |frame: &FileFrame| {
             frame.fields.iter().filter_map(|field| field.spec().field()).collect::<Vec<_>>()

@@ -73,7 +73,6 @@ fn read_value(item: &TableValue<'_>, name: &str) -> Result<PortValue> {
     })
 }
 
-/// The binding to the port with this name.
 pub(super) fn of_port(
     binding: OutputBinding,
     name: &str,

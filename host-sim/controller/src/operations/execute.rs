@@ -258,6 +258,5 @@ impl Controller {
 
 /// Maximum length of a program's name.
 const MAX_NAME: usize = 200;
-/// Maximum number of programs.
 const MAX_PROGRAMS: usize = 256;
 const MAX_CYCLE_MS: f64 = 3_600_000.0;

@@ -73,7 +73,6 @@ impl ScriptLink {
         }
     }
 
-    /// Reports how the script ended.
     pub(super) fn end(&self, scope: &Scope<'_>, result: ScriptResult<()>) {
         self.show(scope);
         let end = match result {

@@ -244,15 +244,12 @@ pub const SLICE: Duration = Duration::from_millis(1);
 pub const SLICE_OPERATIONS: u64 = 500;
 /// Operations that a call counts for, because it switches threads twice.
 const CALL_OPERATIONS: u64 = 50;
-/// Maximum length of a string.
 const MAX_STRING: usize = 4_096;
 /// Maximum number of items in an array, including nested arrays, and in a map.
 const MAX_ITEMS: usize = 1_024;
-/// Maximum number of variables.
 const MAX_VARIABLES: usize = 128;
 /// Maximum depth of function calls.
 const MAX_CALLS: usize = 24;
-/// Maximum depth of expressions.
 const MAX_DEPTH: usize = 32;
 /// Maximum number of programs that have called one another and not returned.
 const MAX_NESTED: usize = 8;

@@ -52,7 +52,6 @@ impl Registers {
         self.keep_shown();
     }
 
-    /// Whether the item is a bit that shows a state.
     pub(super) fn shows_state(&self, item: InitialTarget) -> bool {
         let Some(bit) = item.var_bit() else { return false };
         let place = OUTPUTS.iter().position(|&(group, index)| named(group, index) == Some(bit.var));

@@ -6,7 +6,6 @@ use std::fmt;
 
 /// Maximum length of a head in bytes.
 pub(crate) const MAX_HEAD: usize = 16 << 10;
-/// Maximum number of fields of a head.
 const MAX_FIELDS: usize = 100;
 
 #[derive(Debug, Clone, PartialEq, Eq)]

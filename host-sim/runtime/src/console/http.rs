@@ -192,7 +192,6 @@ async fn linger(mut stream: TcpStream) -> io::Result<()> {
     Ok(())
 }
 
-/// Maximum number of connections.
 const MAX_CONNECTIONS: usize = 8;
 /// How long a refused client may go on sending.
 const LINGER: Duration = Duration::from_millis(300);

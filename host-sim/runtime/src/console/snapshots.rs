@@ -22,7 +22,6 @@ use crate::snapshot::{GatewaySnapshot, SnapshotSlot};
 #[derive(Default)]
 pub(super) struct Snapshots {
     newest: RefCell<Option<Rc<Snapshot>>>,
-    /// The buffer of the next snapshot.
     buffer: RefCell<Option<Box<GatewaySnapshot>>>,
     /// Concurrent readers get the same snapshot.
     refresh: tokio::sync::Mutex<()>,

@@ -113,7 +113,6 @@ impl SupervisorView {
     }
 }
 
-/// The view that the supervisor shares with its readers.
 #[derive(Debug, Default)]
 pub(crate) struct SharedView(Mutex<SupervisorView>);
 
@@ -141,7 +140,6 @@ pub(crate) struct Supervised {
 }
 
 impl Supervised {
-    /// Starts a gateway with its console.
     pub(crate) fn start(
         file: ConfigFile,
         options: &RunOptions,

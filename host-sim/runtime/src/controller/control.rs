@@ -25,7 +25,6 @@ use recipe_io::fairness::yield_fairly;
 use recipe_io::tcp_options;
 use recipe_io::timer;
 
-/// A client of the control socket.
 #[derive(Debug, Default)]
 pub(super) struct ControlClient {
     /// Lines that wait for the client.
@@ -45,7 +44,6 @@ pub(super) struct ControlClient {
 struct Follow {
     /// Empty: all kinds.
     kinds: Vec<String>,
-    /// Number of the next event.
     next: u64,
 }
 

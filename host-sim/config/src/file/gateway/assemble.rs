@@ -137,7 +137,6 @@ impl FileExchange {
         [&self.output, &self.input, &self.pending, &self.refusal]
     }
 
-    /// The exchange with the fields of [`Self::parts`].
     fn builder<'s>(&'s self, fields: &'s [Frames]) -> ExchangeBuilder<'s> {
         let [output, input, ..] = self.parts();
         let fields = |nth: usize| fields.get(nth).map_or(&[][..], first);
