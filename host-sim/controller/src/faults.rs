@@ -166,8 +166,7 @@ impl Controller {
         self.close_clients(link);
     }
 
-    /// Delays every answer of the server from now on. Without effect on the state stream, which has no
-    /// answers.
+    /// Delays every answer of the server from now on. Without effect on the state stream, which has no answers.
     pub fn delay_answers(&mut self, link: Link, delay: Duration) {
         self.quiet.ends();
         self.faults.delay[link as usize] = delay;
@@ -187,8 +186,7 @@ impl Controller {
         self.faults.exception = exception;
     }
 
-    /// Sends only the first `len` bytes of the next state packet, then closes every connection of
-    /// port 2001.
+    /// Sends only the first `len` bytes of the next state packet, then closes every connection of port 2001.
     pub fn cut_next_state_packet(&mut self, len: usize) {
         self.quiet.ends();
         self.faults.state_cut = Some(len);
@@ -239,9 +237,8 @@ impl Controller {
         }
     }
 
-    /// Switches the controller off and on: all connections are closed, the registers get the configuration's
-    /// initial values and otherwise 0, and the robot boots to power off (docs/simulated-controller.md section
-    /// 1). Faults stay.
+    /// Switches the controller off and on: all connections are closed, the registers get the configuration's initial
+    /// values and otherwise 0, and the robot boots to power off (docs/simulated-controller.md section 1). Faults stay.
     pub fn restart(&mut self, now: Instant) {
         self.quiet.ends();
         self.close_all_clients();

@@ -1,5 +1,4 @@
-//! Functions of functional inputs, and states on functional outputs (D27, docs/simulated-controller.md
-//! section 7).
+//! Functions of functional inputs, and states on functional outputs (D27, docs/simulated-controller.md section 7).
 //!
 //! An input's rising edge has the effect of the command on port 2000, without a reply. Several edges at one instant are
 //! executed in the order of [`Function::ALL`].

@@ -4,9 +4,8 @@
 //!
 //! [`Controller`] has port 2000, port 2001, Modbus, UDP 2011, recipe ports and programs behind one run loop.
 //!
-//! In: events of connections and devices, and the time. Out: data to send, and when to call again. Does not
-//! know sockets, devices or clocks; its caller does: a runtime with sockets, or a test that jumps from deadline
-//! to deadline.
+//! In: events of connections and devices, and the time. Out: data to send, and when to call again. Does not know
+//! sockets, devices or clocks; its caller does: a runtime with sockets, or a test that jumps from deadline to deadline.
 //!
 //! One rule: call [`Controller::handle`], then [`Controller::poll_output`] until it returns
 //! [`ControllerOutput::Sleep`]. Polling early is harmless. Errors of a peer are counted and ignored.

@@ -55,8 +55,7 @@ use super::{BuildError, ConnId, Controller, ControllerInput, ControllerOutput};
 /// assert_eq!(robot.take(client), b"6:0:5:2");
 /// ```
 ///
-/// Faults, such as a mute server or an emergency stop, are methods of [`Controller`]: see
-/// [`Self::controller_mut`].
+/// Faults, such as a mute server or an emergency stop, are methods of [`Controller`]: see [`Self::controller_mut`].
 #[derive(Debug)]
 pub struct TestController {
     pub(crate) controller: Controller,
@@ -132,8 +131,7 @@ impl TestController {
         &self.controller
     }
 
-    /// The controller, for faults and operations at the teach pendant. Their effects begin with the next
-    /// [`Self::run`].
+    /// The controller, for faults and operations at the teach pendant. Their effects begin with the next [`Self::run`].
     pub fn controller_mut(&mut self) -> &mut Controller {
         &mut self.controller
     }
@@ -234,10 +232,9 @@ impl TestController {
         std::mem::take(&mut self.sent)
     }
 
-    /// The value of a system variable or an input or output, such as `FloatInputReg[3]` or `DO[1]`, of a state
-    /// such as `running`, or of an item of the state packet such as `drive_error[2]`
-    /// ([`Controller::item`]). A bit is 0.0 or 1.0; other units are those of the item (docs/configuration.md
-    /// section 5).
+    /// The value of a system variable or an input or output, such as `FloatInputReg[3]` or `DO[1]`, of a state such as
+    /// `running`, or of an item of the state packet such as `drive_error[2]` ([`Controller::item`]). A bit is 0.0 or
+    /// 1.0; other units are those of the item (docs/configuration.md section 5).
     ///
     /// # Panics
     /// If there is no such item.

@@ -180,7 +180,7 @@ impl SessionDriver {
         let until = loop {
             match node.poll_output(now(), catalog, buf) {
                 NodeOutput::Open => is_opening = true,
-                // A host builds a birth without interruption.
+                // Continue without yielding: a host measures a birth in one go.
                 NodeOutput::Busy => {}
                 NodeOutput::Keep { bd_seq } => listener.keep(bd_seq),
                 NodeOutput::Send(bytes) => {

@@ -1,8 +1,7 @@
 //! The writers of variables: a table for a person who configures other tools.
 //!
-//! In: the frames of a file. Out: one row for each use of a variable, or for each field without one, as Markdown
-//! or CSV: the variable with its place in the controller's Modbus map, the port, the frame, and where in the frame
-//! it is.
+//! In: the frames of a file. Out: one row for each use of a variable, or for each field without one, as Markdown or
+//! CSV: the variable with its place in the controller's Modbus map, the port, the frame, and where in the frame it is.
 
 use proto_core::config::FieldSpec;
 use proto_core::device::{Bits, ByteOrder, Digits, Element, Kind, Place, Text, TextWidth, Width};

@@ -1,5 +1,4 @@
-//! A CAN bus in user space (proto-core/docs/wire/slcan.md section 4), with one port and any number of slcan
-//! clients.
+//! A CAN bus in user space (proto-core/docs/wire/slcan.md section 4), with one port and any number of slcan clients.
 
 mod clients;
 

@@ -1,5 +1,4 @@
-//! Files and symbolic links that are created atomically: under a temporary name in the same folder, and then
-//! renamed.
+//! Files and symbolic links that are created atomically: under a temporary name in the same folder, and then renamed.
 //!
 //! Does not know their contents. The caller decides whether an existing one may be replaced.
 

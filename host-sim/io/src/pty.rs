@@ -61,8 +61,7 @@ impl Pty {
         Some(HandoverPty { link, master: master.into_inner(), terminal, unread: unread.get() })
     }
 
-    /// Opens a new pseudoterminal in raw mode, with a symbolic link to it at `link`, in the current tokio
-    /// runtime.
+    /// Opens a new pseudoterminal in raw mode, with a symbolic link to it at `link`, in the current tokio runtime.
     ///
     /// An existing link is replaced if it leads to a pseudoterminal of a program that is gone. Anything else stays.
     ///

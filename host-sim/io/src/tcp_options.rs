@@ -73,8 +73,7 @@ pub fn reset_on_close(stream: &TcpStream) -> io::Result<()> {
 /// (TIOCOUTQ).
 pub fn unacknowledged(stream: impl AsFd) -> io::Result<usize> {
     let mut count: libc::c_int = 0;
-    // SAFETY: the descriptor is open while it is borrowed; the call writes one int to `count`, which
-    // outlives it.
+    // SAFETY: the descriptor is open while it is borrowed; the call writes one int to `count`, which outlives it.
     let done = unsafe { libc::ioctl(stream.as_fd().as_raw_fd(), libc::TIOCOUTQ, &raw mut count) };
     if done < 0 {
         return Err(io::Error::last_os_error());

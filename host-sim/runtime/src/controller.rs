@@ -322,8 +322,7 @@ impl ControllerRuntime {
         }
     }
 
-    /// Closes a connection after its waiting data was sent. If too many are waiting for that, the oldest is
-    /// aborted.
+    /// Closes a connection after its waiting data was sent. If too many are waiting for that, the oldest is aborted.
     fn close(&self, connection: Rc<Connection>) {
         connection.close();
         if connection.has_unsent() {

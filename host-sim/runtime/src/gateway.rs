@@ -1,8 +1,8 @@
 //! The gateway's engine on real sockets and devices.
 //!
 //! The engine, devices and sockets share one thread. Input is reported to the engine at once, and its outputs are
-//! executed before anything else is read, so a single call of the engine lies between the last byte of a field frame and
-//! the request to the controller.
+//! executed before anything else is read, so a single call of the engine lies between the last byte of a field frame
+//! and the request to the controller.
 
 mod doctor;
 mod open;

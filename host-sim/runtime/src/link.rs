@@ -139,8 +139,7 @@ impl LinkControl {
         }
     }
 
-    /// Whether the peer is the controller, or a program on this host, which could connect to the controller
-    /// as well.
+    /// Whether the peer is the controller, or a program on this host, which could connect to the controller as well.
     fn is_controller(&self, name: &str, controller: &[IpAddr], peer: SocketAddr) -> bool {
         let address = peer.ip().to_canonical();
         let known = controller.contains(&address) || THIS_HOST.contains(&address);

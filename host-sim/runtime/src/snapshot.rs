@@ -1,7 +1,7 @@
 //! Snapshots of a running gateway for other threads.
 //!
-//! A reader provides a buffer and requests a snapshot; the gateway's thread copies the engine into it. That thread never
-//! waits for a reader: if the buffer is locked at that moment, it is not filled.
+//! A reader provides a buffer and requests a snapshot; the gateway's thread copies the engine into it. That thread
+//! never waits for a reader: if the buffer is locked at that moment, it is not filled.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};

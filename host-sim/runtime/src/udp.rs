@@ -15,8 +15,7 @@ pub(super) fn keep_errors(socket: &UdpSocket) -> io::Result<()> {
         SocketAddr::V4(_) => (libc::SOL_IP, libc::IP_RECVERR),
         SocketAddr::V6(_) => (libc::SOL_IPV6, libc::IPV6_RECVERR),
     };
-    // SAFETY: the descriptor is open while `socket` is borrowed; the option's value is an int that outlives
-    // the call.
+    // SAFETY: the descriptor is open while `socket` is borrowed; the option's value is an int that outlives the call.
     let done = unsafe {
         libc::setsockopt(
             socket.as_raw_fd(),

@@ -1,5 +1,5 @@
-//! A thread shared by several runtimes: one wake-up serves all of them, so they sleep less often than on threads of their
-//! own.
+//! A thread shared by several runtimes: one wake-up serves all of them, so they sleep less often than on threads of
+//! their own.
 
 use std::io;
 use std::pin::Pin;

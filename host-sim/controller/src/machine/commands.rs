@@ -31,8 +31,7 @@ impl Machine {
         }
     }
 
-    /// Whether `run` is allowed now. The caller then starts the program and reports
-    /// [`Machine::program_started`].
+    /// Whether `run` is allowed now. The caller then starts the program and reports [`Machine::program_started`].
     ///
     /// # Errors
     /// The error that was recorded.

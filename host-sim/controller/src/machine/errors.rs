@@ -1,5 +1,4 @@
-//! The error numbers that `getlasterror` and the state stream show
-//! (docs/simulated-controller.md section 2).
+//! The error numbers that `getlasterror` and the state stream show (docs/simulated-controller.md section 2).
 //!
 //! The interface description lists none; these numbers are the simulated controller's own.
 

@@ -5,8 +5,7 @@
 //! programs, registers or states. Everything is a closed formula of time: nothing is stepped, and the same instant
 //! always gives the same numbers.
 //!
-//! The geometry is that of a generic six-axis cobot with a reach of about 0.9 m, not the calibration of a
-//! product.
+//! The geometry is that of a generic six-axis cobot with a reach of about 0.9 m, not the calibration of a product.
 
 mod clock;
 mod geometry;

@@ -1,5 +1,4 @@
-//! Robot programs: Rhai scripts that run in lock-step with the model's clock
-//! (docs/simulated-controller.md section 4).
+//! Robot programs: Rhai scripts that run in lock-step with the model's clock (docs/simulated-controller.md section 4).
 //!
 //! In: a compiled [`Script`], and answers to its calls. Out: one [`Call`] after the other, the program's
 //! variables, and how it ended. Does not know ports, registers or motion.

@@ -13,8 +13,7 @@ use super::{PLACES, PacketItem, Registers};
 use crate::motion::{Loads, Payload};
 
 impl Registers {
-    /// The state packet of 1468 bytes. `global_speed` is the offset of the global speed, if the dialect has
-    /// one.
+    /// The state packet of 1468 bytes. `global_speed` is the offset of the global speed, if the dialect has one.
     pub fn packet(&self, global_speed: Option<u16>) -> Box<[u8; LEN]> {
         let (arm, target, status) = (&self.arm, &self.target, &self.status);
         let loads = self.loads();

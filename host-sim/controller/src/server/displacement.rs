@@ -1,7 +1,6 @@
 //! Which client is disconnected when a new client connects to a full server (docs/devices.md section 7).
 //!
-//! A host that only holds connections open must neither keep out clients that send requests nor displace
-//! them.
+//! A host that only holds connections open must neither keep out clients that send requests nor displace them.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;

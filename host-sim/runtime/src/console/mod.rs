@@ -1,7 +1,7 @@
 //! The console's server: the API of docs/api.md over HTTP, for the gateway and the simulated controller.
 //!
-//! It runs on an ordinary thread. It takes snapshots of the gateway at most ten times a second for all clients together,
-//! and never blocks the gateway's thread.
+//! It runs on an ordinary thread. It takes snapshots of the gateway at most ten times a second for all clients
+//! together, and never blocks the gateway's thread.
 
 mod api;
 mod check;

@@ -1,8 +1,8 @@
 //! Findings of a running gateway, and of one that only listens.
 //!
-//! A running gateway is examined once a second, if its findings are read. The gateway's thread copies the engine and the
-//! port records into a buffer; another thread examines the copy, logs changes, and returns the buffer. Until then nothing
-//! is copied.
+//! A running gateway is examined once a second, if its findings are read. The gateway's thread copies the engine and
+//! the port records into a buffer; another thread examines the copy, logs changes, and returns the buffer. Until then
+//! nothing is copied.
 //!
 //! A gateway that only listens sends nothing to the controller, and nothing to the field except exchanges if these are
 //! enabled: every output passes [`super::TxPolicy`]. Its engine sees no link but the state stream, on which it never

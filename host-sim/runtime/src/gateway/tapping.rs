@@ -42,8 +42,8 @@ pub(super) struct Tapping {
 }
 
 impl Tapping {
-    /// Starts to record a gateway whose engine was not called yet. Passes are recorded if there is an image, which is the
-    /// first entry of a recording.
+    /// Starts to record a gateway whose engine was not called yet. Passes are recorded if there is an image, which is
+    /// the first entry of a recording.
     pub(super) fn begin(watch: &Watch, cell: Cell, at: Instant, image: Option<&[u8]>) -> io::Result<Self> {
         let (ring, consumer) = RingBuffer::new(RING);
         let began = Record { at, lost: 0, what: What::Began(Arc::new(cell)) };

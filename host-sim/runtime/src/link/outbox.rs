@@ -1,7 +1,7 @@
 //! A link's send queue, with direct access to its socket.
 //!
-//! Bytes are written to the socket at once, because waking the link's task takes longer than the engine needs for a field
-//! frame. The task does the rest: it reports completed transmissions, and sends what the kernel did not accept.
+//! Bytes are written to the socket at once, because waking the link's task takes longer than the engine needs for a
+//! field frame. The task does the rest: it reports completed transmissions, and sends what the kernel did not accept.
 
 use std::collections::VecDeque;
 use std::io;

@@ -46,8 +46,7 @@ impl LinkTask<'_> {
         self.pump(session, socket, Some(client), events).await
     }
 
-    /// The controller's first datagram of this session: its sender, the controller's addresses, and the
-    /// datagram.
+    /// The controller's first datagram of this session: its sender, the controller's addresses, and the datagram.
     async fn first_datagram(
         &self,
         session: LinkSession,
@@ -153,8 +152,7 @@ async fn receive(
 /// Drops datagrams that wait in the socket, because their age is unknown.
 fn discard_waiting(socket: &UdpSocket) {
     for _ in 0..MAX_WAITING {
-        // A system call, because the reactor may not have polled the socket yet. An error counts as a
-        // datagram.
+        // A system call, because the reactor may not have polled the socket yet. An error counts as a datagram.
         let discarded = rustix::net::recv(socket, &mut [0_u8; 1], RecvFlags::DONTWAIT | RecvFlags::TRUNC);
         if discarded == Err(Errno::AGAIN) {
             return;
