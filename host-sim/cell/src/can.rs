@@ -54,13 +54,13 @@ impl std::fmt::Debug for CanBus {
     }
 }
 
-/// A frame that has crossed the bus.
+/// A frame that has been transmitted.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Crossed {
     pub from: End,
     pub frame: CanFrame,
     pub arrives: bool,
-    /// No frame of the sender waits any more.
+    /// The sender has no more waiting frames.
     pub was_last: bool,
 }
 

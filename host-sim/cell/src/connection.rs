@@ -32,7 +32,7 @@ pub(super) struct Connection {
     pub accepted: bool,
     /// The controller has closed its end.
     pub closing: bool,
-    /// The gateway has closed its end, and the controller does not know it yet.
+    /// The gateway has closed its end, and the controller does not know this yet.
     pub abandoned: bool,
     /// The controller has lost its end in a power cut: data that arrives there is answered with a reset.
     pub forgotten: bool,
@@ -40,7 +40,7 @@ pub(super) struct Connection {
     pub owes_ack: bool,
     /// The gateway's transport will check for a timeout: [`super::due::Due::UserTimeout`] is queued.
     pub is_watched: bool,
-    /// What is in a device's log once so many bytes have arrived, and when the last of them left.
+    /// Entries for the device's log: the bytes that must have arrived before, and when the last of them left.
     pub acts: VecDeque<(u64, Instant, Act)>,
 }
 

@@ -1,12 +1,11 @@
-//! Gateways that break their promises: inputs and outputs of the engine are changed on the way, and the
-//! model has to report it.
+//! Gateways that break their promises: inputs and outputs of the engine are changed, and the model has to report it.
 
 use proto_core::engine::{Endpoint, Input, LinkId, Output, PortId, Transport};
 use proto_core::time::Instant;
 
 use super::Cell;
 
-/// An output that the engine did not make.
+/// An output that did not come from the engine.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Forged {
     Link(LinkId, Vec<u8>),
@@ -14,7 +13,7 @@ pub(super) enum Forged {
     Open(LinkId),
 }
 
-/// Returns the bytes that the engine gets in place of the input's; `None` leaves the input as it is.
+/// Returns the bytes that replace the input's; `None` leaves the input as it is.
 pub(super) type Inward = Box<dyn FnMut(Instant, &Input<'_>) -> Option<Vec<u8>>>;
 /// Returns what replaces an output, or precedes a `Sleep`; `None` leaves the output as it is.
 pub(super) type Outward = Box<dyn FnMut(Instant, &Input<'_>, &Output<'_>) -> Option<Vec<Forged>>>;

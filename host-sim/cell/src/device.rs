@@ -23,20 +23,19 @@ pub trait Device<M> {
         Vec::new()
     }
 
-    /// What it did as devices that are asked since the last call, in order. The model compares the
-    /// gateway's values with it.
+    /// The actions of polled devices since the last call, in order. The model compares the gateway's values with them.
     fn take_done(&mut self) -> Vec<SlaveDone> {
         Vec::new()
     }
 }
 
-/// A device that is a TCP server, such as of Modbus TCP. It has one connection at a time: a new one takes the place of
-/// the one before.
+/// A device that is a TCP server, such as of Modbus TCP. It has one connection at a time: a new connection replaces the
+/// previous one.
 pub trait Server {
-    /// A connection is there.
+    /// A connection was opened.
     fn opened(&mut self, now: Instant);
 
-    /// The connection is gone, and what was not sent on it with it.
+    /// The connection is gone, and its unsent data is lost.
     fn closed(&mut self, now: Instant);
 
     /// Bytes arrived on the connection, in pieces of any size.
@@ -48,37 +47,37 @@ pub trait Server {
     /// The deadline has come; the next one must be later than `now`.
     fn poll(&mut self, now: Instant) -> Vec<Served>;
 
-    /// What it did since the last call, in order.
+    /// The entries of its log since the last call, in order.
     fn take_done(&mut self) -> Vec<SlaveDone>;
 }
 
-/// What a device did, as its own log has it.
+/// An entry in a device's own log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Act {
-    /// It received a whole request of its own: an order, or a question.
+    /// It received a whole request in its own format: an order or a query.
     Heard(Option<Order>),
     /// It executed an order with these values.
     Did(Order, Vec<u32>),
     /// It refused an order with a code.
     Refused(Order, u8),
-    /// A reply left, or did not although it should.
+    /// A reply was sent, or was due but not sent.
     Replied {
-        /// The order that it is a reply to, if it is one.
+        /// The order that was replied to, if any.
         order: Option<Order>,
-        /// It is not the same as the request, so nobody takes it for an echo.
+        /// The reply differs from the request, so it cannot be taken for an echo.
         tells: bool,
-        /// It left as it should be.
+        /// The reply was sent unchanged.
         is_whole: bool,
-        /// And it was at the gateway in time for sure.
+        /// The reply was certainly at the gateway in time.
         in_time: bool,
     },
-    /// Something arrived of it that is no reply to what it was asked: whether it is heard by that, nobody knows.
+    /// Something that is not a reply arrived from the device; the gateway may or may not take it for a sign of life.
     Garbled,
-    /// The value of this number is this from now on.
+    /// The variable with this number has this value from now on.
     Holds(usize, u16),
-    /// It lost its power, and with it what it was told.
+    /// It lost its power, and everything that it was told.
     PowerOff,
-    /// It is there again.
+    /// It has power again.
     PowerOn,
 }
 
@@ -91,61 +90,60 @@ pub enum Order {
     Step,
     /// To stop.
     Stop,
-    /// What it is told at its start, and what moves it: homing, a mode.
+    /// What it gets at its start, and what moves it: homing, a mode.
     Start,
-    /// A value that it keeps.
+    /// A value that it stores.
     Keep,
 }
 
-/// What a TCP server does.
+/// An action of a TCP server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Served {
-    /// It sends bytes. The act is in its log once the last of them has arrived.
+    /// It sends bytes. The act is logged once the last byte has arrived.
     Bytes(Vec<u8>, Option<Act>),
     /// It closes its connection, in both directions.
     Close,
-    /// It sends nothing more on its connection, and still receives.
+    /// It closes its sending side, and still receives.
     HalfClose,
     /// It resets its connection.
     Reset,
-    /// It loses its power: its connection is gone, and nobody is told.
+    /// It loses its power: its connection disappears without notice.
     PowerOff,
     /// It has power again.
     PowerOn,
 }
 
-/// What a device did that is asked: a slave of a Modbus line, or a peer with frames of its own.
+/// An action of a polled device: a slave of a Modbus line, or a peer with frames of its own.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlaveDone {
-    /// Its address or number.
+    /// Address or number of the device.
     pub slave: u8,
-    /// What it did.
+    /// The action.
     pub what: Done,
 }
 
-/// What a slave does.
+/// An action of a slave.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Done {
-    /// It made a reply, which may be changed or lost before it leaves.
+    /// It made a reply, which may be changed or lost before it is sent.
     Answered {
-        /// The first register or coil that was asked for or written.
+        /// The first register or coil that was read or written.
         address: u16,
-        /// How many.
+        /// Number of registers or coils.
         count: u16,
         /// The whole frame.
         reply: Vec<u8>,
     },
-    /// It took values, from a request to itself or to all.
+    /// It accepted values, from a request to itself or to all.
     Wrote {
-        /// Coils, else holding registers.
+        /// Coils, otherwise holding registers.
         coils: bool,
-        /// The first one.
+        /// The first register or coil.
         address: u16,
         /// The registers, or 0 and 1 for coils.
         values: Vec<u16>,
     },
-    /// It made a frame of its own, which may be changed or lost before it leaves: a reply, or one that
-    /// nobody asked for.
+    /// It made a frame of its own, which may be changed or lost before it is sent: a reply, or an unsolicited frame.
     Replied {
         /// The exchange, counted from 0 on the port.
         exchange: usize,

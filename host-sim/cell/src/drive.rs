@@ -55,7 +55,7 @@ impl Cell {
         self.queue.next().min(engine).min(self.controller_wake).min(self.devices_wake)
     }
 
-    /// Something has been done with a device, which may have another deadline now.
+    /// Updates the deadline after something has happened to a device.
     pub(super) fn note_deadlines(&mut self) {
         let lines = self.lines.iter().filter_map(|line| line.device.as_ref()).map(|device| device.deadline());
         let buses = self.buses.iter().filter_map(|bus| bus.device.as_ref()).map(|device| device.deadline());
@@ -144,7 +144,7 @@ impl Cell {
         if let Some(oracle) = &mut self.oracle {
             oracle.input(now, &input, &self.engine);
         }
-        // An input can come of an output: each has a buffer of its own.
+        // An output can cause an input, so each level has its own buffer.
         let mut buf = self.buffer.take().unwrap_or_else(|| Box::new([0; OUTPUT_BUFFER]));
         loop {
             let output = self.engine.poll_output(now, &mut buf);

@@ -201,7 +201,7 @@ impl Cell {
         self.bus_state(bus, BusState::BusOff);
     }
 
-    /// It is error-active again.
+    /// The port's CAN controller is error-active again.
     pub fn bus_on(&mut self, bus: BusId) {
         self.buses[bus.0].is_off = false;
         if let Some(judge) = &mut self.judge {
@@ -228,7 +228,7 @@ impl Cell {
         self.controller_started();
     }
 
-    /// Same, with all registers at 0.
+    /// As [`Self::restart_controller`], with all registers at 0.
     pub fn clear_controller(&mut self) {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, &[0]);

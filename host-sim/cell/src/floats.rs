@@ -8,15 +8,15 @@ use proto_core::wire::scalar::ScalarType;
 use super::{Cell, Entry, What};
 
 impl Cell {
-    /// The controller sends `value` for this variable from now on, whatever its register has.
+    /// The controller sends `value` for this variable from now on, whatever its register contains.
     pub fn corrupt_float(&mut self, var: SysVar, value: f32) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &value.to_le_bytes());
-        // A variable that is no float is left as it is.
+        // A variable that is not a float is not changed.
         let _ = self.controller_mut().corrupt(&var.to_string(), value);
         self.note_fault(None);
     }
 
-    /// It sends the register's value again.
+    /// The controller sends the register's value again.
     pub fn heal(&mut self, var: SysVar) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &[]);
         let _ = self.controller_mut().heal(&var.to_string());

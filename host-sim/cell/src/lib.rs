@@ -104,7 +104,7 @@ enum End {
     Device = 1,
 }
 
-/// Why a cell cannot be made.
+/// Why a cell cannot be created.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum CellError {
@@ -125,14 +125,14 @@ impl std::fmt::Display for CellError {
 
 impl std::error::Error for CellError {}
 
-/// A recipe port of the controller that speaks over the network.
+/// A recipe port of the controller on a network.
 #[derive(Debug)]
 struct Client {
-    /// The gateway's listening link that it connects or sends to; `None` if there is none.
+    /// The gateway's listening link that the port connects or sends to, if there is one.
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
-    /// The socket from which it sends datagrams.
+    /// The socket that it sends datagrams from.
     socket: u64,
 }
 
@@ -148,7 +148,7 @@ pub struct Cell {
     controller_is_seen: bool,
     /// The earliest deadline of all devices.
     devices_wake: Instant,
-    /// For what the engine sends; `None` while it is used.
+    /// Buffer for the engine's outputs; `None` while it is in use.
     buffer: Option<Box<[u8; OUTPUT_BUFFER]>>,
     now: Instant,
     queue: Queue<Due>,
@@ -201,11 +201,11 @@ impl Cell {
         Self::build(gateway, controller, seed, None)
     }
 
-    /// Same, with a recording of all inputs and outputs of the engine from the start, for
+    /// As [`Self::new`], with a recording of all inputs and outputs of the engine from the start, for
     /// [`Self::into_recording`].
     ///
     /// # Errors
-    /// Same as [`Self::new`].
+    /// As [`Self::new`].
     pub fn recorded(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
         Self::build(gateway, controller, seed, Some(Recorder::new(gateway)))
     }
@@ -324,7 +324,7 @@ impl Cell {
         }
     }
 
-    /// Same as [`Self::run`], in milliseconds.
+    /// As [`Self::run`], in milliseconds.
     pub fn run_ms(&mut self, millis: u64) {
         self.run(Duration::from_millis(millis));
     }
@@ -338,8 +338,8 @@ impl Cell {
     }
 }
 
-/// The gateway's address for the controller's UDP server: a new one each time the link is opened,
-/// as a new socket has.
+/// The gateway's address for the controller's UDP server: a new address each time the link is opened, as for a new
+/// socket.
 fn udp_peer(generation: u64) -> SocketAddr {
     (CLIENT_IP, 40_000 + (generation % 10_000) as u16).into()
 }

@@ -36,11 +36,11 @@ pub enum Wiring {
 pub struct LineCounters {
     /// Transmissions of the device.
     pub device_sent: u64,
-    /// Their bytes.
+    /// Bytes of the device's transmissions.
     pub device_bytes: u64,
     /// Transmissions of the port.
     pub port_sent: u64,
-    /// Their bytes.
+    /// Bytes of the port's transmissions.
     pub port_bytes: u64,
     /// Transmissions that began while the other end was sending.
     pub overlaps: u64,
@@ -60,12 +60,12 @@ pub struct Line {
     pub wiring: Wiring,
     /// Number of bytes per million that have a bit flipped.
     pub noise_ppm: u32,
-    /// The port's adapter gives back what the port sends, whatever the configuration says.
+    /// The port's adapter echoes what the port sends, whatever the configuration says.
     pub gives_back: bool,
     /// Counters.
     pub counters: LineCounters,
     pub(super) connected: bool,
-    /// The port's adapter is there.
+    /// The port's adapter is plugged in.
     pub(super) is_plugged: bool,
     pub(super) device: Option<Box<dyn Device<Vec<u8>>>>,
     busy_until: [Instant; 2],

@@ -15,12 +15,11 @@ pub struct Network {
     pub jitter: Duration,
     /// Data sent on a connection is cut into segments of 1 to this many bytes, at random.
     pub longest_segment: Option<usize>,
-    /// A segment waits up to this long, at random, for the next one, and arrives in one piece with
-    /// it.
+    /// A segment waits a random time up to this for the next segment, and arrives together with it.
     pub merge: Duration,
     /// Number of datagrams per million that are lost.
     pub loss_ppm: u32,
-    /// Number per million that arrive twice.
+    /// Number of datagrams per million that arrive twice.
     pub duplicate_ppm: u32,
     /// The controller's TCP acknowledges this long after data has arrived, unless it sends
     /// something before.
@@ -28,13 +27,13 @@ pub struct Network {
     /// The gateway's driver reports acknowledgements this long after they arrive, and before it reports
     /// received data.
     pub ack_report: Duration,
-    /// How many unacknowledged bytes the gateway's transport keeps. Beyond that the driver reports a
-    /// transmission as sent only when there is room again.
+    /// Capacity of the gateway's transport for unacknowledged bytes. If it is exceeded, the driver reports a
+    /// transmission as sent only once there is room again.
     pub send_buffer: u64,
 }
 
 impl Default for Network {
-    /// 200 µs, nothing split, nothing lost.
+    /// 200 µs, without splits and losses.
     fn default() -> Self {
         Self {
             delay: Duration::from_micros(200),
@@ -67,7 +66,7 @@ pub enum Way {
 }
 
 impl Way {
-    /// Both.
+    /// Both directions.
     pub(super) const BOTH: [Self; 2] = [Self::Up, Self::Down];
 
     pub(super) const fn back(self) -> Self {
@@ -104,7 +103,7 @@ pub(super) struct Gate {
     pub is_full: bool,
     /// The driver will read the acknowledgements: [`super::due::Due::ReadAcks`] is queued.
     pub reads_acks: bool,
-    /// Where the gateway listens for datagrams: the sender that it answers.
+    /// For a listening datagram link: the sender that the gateway replies to.
     pub answers_to: Option<Sender>,
     pub rng: Rng,
 }

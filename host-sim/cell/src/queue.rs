@@ -1,6 +1,6 @@
 //! A queue of events, ordered by time and, at one instant, by arrival.
 //!
-//! What is ordered is small, and the events stay where they are: most of a cell's time would go into moving them.
+//! Only small entries are ordered; the events are not moved, which would take most of a cell's time.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -18,8 +18,7 @@ pub(super) struct Queue<T> {
     pushed: u64,
 }
 
-/// An instant, a number that grows with each entry, and a place in `things`: in one number, so that one comparison
-/// orders two of them.
+/// An instant, a sequence number, and a place in `things`, in one number: one comparison orders two entries.
 type Entry = u128;
 
 impl<T> Queue<T> {
@@ -63,7 +62,7 @@ impl<T> Queue<T> {
     }
 }
 
-/// More events than the model allows to wait at once; 2^40 can be pushed.
+/// More waiting events than the model allows; 2^40 can be pushed.
 const PLACE_BITS: u32 = 24;
 const MOST: usize = 1 << PLACE_BITS;
 

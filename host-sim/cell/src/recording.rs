@@ -7,7 +7,7 @@ use proto_core::record::{Entry, MAGIC, totals};
 use proto_core::time::Instant;
 use recipe_config::board::image_of;
 
-/// A recording in the making.
+/// A recording in progress.
 #[derive(Debug)]
 pub(super) struct Recorder {
     image: Vec<u8>,

@@ -50,8 +50,7 @@ impl Rng {
         (0..len).map(|_| self.next_u64() as u8).collect()
     }
 
-    /// A separate generator for a part of the cell, so that what one part draws does not change what
-    /// another one draws.
+    /// A separate generator for a part of the cell: the numbers drawn by one part do not change those of another.
     #[must_use]
     pub fn fork(&mut self) -> Self {
         Self(self.next_u64())

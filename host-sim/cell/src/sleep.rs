@@ -1,9 +1,8 @@
-//! A gateway that is not called for a while: its process is stopped, or its machine is busy or
-//! suspended. Everything else goes on, and its input waits in buffers like a kernel's.
+//! A gateway that is not called for a while: its process is stopped, or its machine is busy or suspended. Everything
+//! else continues, and its input waits in buffers like a kernel's.
 //!
-//! Bounds: 4 KiB per line, 256 frames per bus, 256 datagrams per link; more is lost. Connections lose
-//! nothing: data stays with the sender. The kernel still sends, acknowledges and retransmits what was
-//! sent before.
+//! Limits: 4 KiB per line, 256 frames per bus, 256 datagrams per link; more is lost. Connections lose nothing: data
+//! stays with the sender. The kernel still sends, acknowledges and retransmits what was sent before.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::time::Duration;
@@ -16,7 +15,7 @@ use super::{Cell, What};
 /// Events that wait for the gateway.
 #[derive(Debug, Default)]
 pub(super) struct Waiting {
-    /// The number of the stall: of several that overlap, only the newest one wakes the gateway.
+    /// The number of the stall: only the newest of several overlapping stalls wakes the gateway.
     generation: u64,
     ports: Vec<(PortId, PortEvent)>,
     links: Vec<Due>,
@@ -34,8 +33,7 @@ pub(super) enum PortEvent {
 }
 
 impl Cell {
-    /// The gateway is not called for this long. Then it gets everything that waits, and a tick. A stall
-    /// that has begun is prolonged.
+    /// The gateway is not called for this long. Then it gets all waiting input, and a tick. Prolongs a present stall.
     pub fn stall_gateway(&mut self, span: Duration) {
         self.trace.add(self.now, What::Fault, super::Entry::GATEWAY, &span.as_micros().to_le_bytes());
         self.stalls += 1;
@@ -175,7 +173,7 @@ impl Waiting {
 
 /// Number of bytes that a kernel keeps for a line.
 const LINE_BUFFER: usize = 4_096;
-/// Number of frames that it keeps for a bus.
+/// Number of frames that a kernel keeps for a bus.
 const MAX_FRAMES: usize = 256;
-/// Number of datagrams that it keeps for a socket.
+/// Number of datagrams that a kernel keeps for a socket.
 const MAX_DATAGRAMS: usize = 256;

@@ -59,12 +59,12 @@ pub enum FaultKind {
     GatewayRestart,
     /// The gateway is not called for less than half a second.
     GatewayStall,
-    /// It is not called for longer.
+    /// The gateway is not called for longer than that.
     GatewaySleep,
 }
 
 impl FaultKind {
-    /// All of them.
+    /// All kinds.
     pub const ALL: [Self; 29] = [
         Self::Refused,
         Self::BlackHole,

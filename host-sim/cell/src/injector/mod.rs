@@ -209,7 +209,7 @@ impl FaultInjector {
     }
 }
 
-/// A fault of a link: how it is repaired, if it is. `lasts` is for how long, if that is not usual.
+/// Injects a fault of a link; returns how it is repaired, if it is. `lasts` is an unusual duration.
 fn link_fault(
     rng: &mut Rng,
     cell: &mut Cell,
@@ -287,7 +287,7 @@ fn link_fault(
     })
 }
 
-/// A fault of one of the controller's servers, or of what it sends.
+/// Injects a fault of one of the controller's servers, or of its data.
 fn server_fault(
     rng: &mut Rng,
     cell: &mut Cell,
@@ -422,7 +422,7 @@ fn apply(cell: &mut Cell, repair: Repair, networks: &BTreeMap<LinkId, Network>) 
     }
 }
 
-/// The links whose cable it is; all links if `None`.
+/// The links that share the cable; all links for `None`.
 fn cables(cell: &Cell, link: Option<LinkId>) -> Vec<LinkId> {
     link.map_or_else(|| cell.link_ids().collect(), |link| vec![link])
 }

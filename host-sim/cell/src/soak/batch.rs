@@ -36,9 +36,9 @@ pub struct Batch {
 /// A failed run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Failure {
-    /// The run's index in the batch.
+    /// Index of the run in the batch.
     pub run: usize,
-    /// The run's own seed.
+    /// Seed of the run.
     pub seed: u64,
     /// The cell's name.
     pub cell: String,
@@ -80,7 +80,7 @@ pub struct Total {
     pub writes: u64,
     /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
-    /// What became of events of devices that are judged.
+    /// Results of events of judged devices.
     pub outcomes: BTreeMap<String, u64>,
     /// One hash of the traces of all runs.
     pub hash: u64,
@@ -158,8 +158,8 @@ impl Batch {
         digests.into_iter()
     }
 
-    /// The cells' names, with a hash of each one's configuration and of the first moments of its first run:
-    /// the same on two machines that would run the batch alike.
+    /// The cells' names, each with a hash of its configuration and of the start of its first run: equal on two machines
+    /// that would run the batch alike.
     pub fn fingerprints(&self) -> Vec<(String, u64)> {
         let first_moments = |nth: usize, scenario: &Scenario| {
             let mut soak = Soak::new(scenario, self.seed_of(nth), self.level).ok()?;
@@ -167,7 +167,7 @@ impl Batch {
             Some(soak.report().digest)
         };
         let of = |(nth, scenario): (usize, &Scenario)| {
-            // A panic is reported where that run is part of a share.
+            // A panic is reported by the share that contains that run.
             let sample = catch_unwind(AssertUnwindSafe(|| first_moments(nth, scenario))).ok().flatten();
             let words = [scenario.hash(), sample.unwrap_or(0)];
             (scenario.name.clone(), words.into_iter().fold(0, mix))
