@@ -255,7 +255,7 @@ impl RejectionDocument {
 
 impl ControllerDocument {
     fn states(&self) -> States {
-        // The codes are those of the controller's newest version, whatever its version is.
+        // The codes are those of the newest controller version, whatever version the controller has.
         States {
             mode: OperationMode::from_code(self.mode.code),
             robot: RobotState::from_code(self.robot.code),
