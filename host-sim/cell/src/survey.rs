@@ -1,4 +1,4 @@
-//! Which paths to the controller work at present. The model needs it to know what should have arrived.
+//! The present state of the paths to the controller, from which the model derives what should have arrived.
 
 use proto_core::engine::{LinkId, LinkKind};
 use proto_core::time::Duration;
@@ -26,7 +26,7 @@ impl Cell {
         self.note_fault(None);
     }
 
-    /// A fault began or ended, on one link or on all.
+    /// Records that a fault began or ended, on one link or on all links.
     pub(super) fn note_fault(&mut self, link: Option<LinkId>) {
         if let Some(oracle) = &mut self.oracle {
             oracle.note_fault(link, self.now);

@@ -1,5 +1,5 @@
-//! One direction of a TCP connection: data arrives once and in order, or not at all; data lost in
-//! the network is sent again after growing waits.
+//! One direction of a TCP connection: data arrives once and in order, or not at all. Data lost in the network is
+//! retransmitted after growing delays.
 //!
 //! In: what the sender sends, and whether the path is cut. Out: when something arrives or is
 //! retransmitted. Does not model windows or congestion: after a loss everything waits for the next
@@ -15,7 +15,7 @@ use super::network::{Gate, Item, Way};
 #[derive(Debug)]
 pub(super) struct Pipe {
     segments: VecDeque<Segment>,
-    /// When the newest segment arrives: later ones do not overtake it.
+    /// When the newest segment arrives; later segments do not overtake it.
     newest: Instant,
     /// Nothing arrives until [`super::Cell::release`].
     pub held: bool,
@@ -88,7 +88,8 @@ impl Pipe {
         }
     }
 
-    /// Hands an item over; `arrives` gets when each of its segments arrives. None does while an earlier one is lost.
+    /// Sends an item; `arrives` gets the arrival of each of its segments. None arrives while an earlier segment is
+    /// lost.
     pub(super) fn send(
         &mut self,
         now: Instant,
@@ -138,8 +139,8 @@ impl Pipe {
         }
     }
 
-    /// Takes the next item that has arrived; bytes that came together are one piece. Also returns how
-    /// many bytes of the other direction are acknowledged.
+    /// Removes the next item that has arrived; bytes that arrived together are one piece. Also returns how many bytes
+    /// of the other direction are acknowledged.
     pub(super) fn next_arrived(&mut self, now: Instant) -> (Arrived, u64) {
         let mut acks = 0;
         if self.held || self.dead {
@@ -178,7 +179,7 @@ impl Pipe {
         (Arrived::Item(Item::Bytes(joined)), acks)
     }
 
-    /// Loses what would arrive now; returns when it is retransmitted, if that was not known yet.
+    /// Loses everything that would arrive now; returns the retransmission time, if it is new.
     pub(super) fn lose(&mut self, now: Instant) -> Option<Instant> {
         let mut first = None;
         for segment in self.segments.iter_mut().filter(|segment| segment.arrives <= now) {
@@ -188,8 +189,7 @@ impl Pipe {
         self.schedule_retransmission(now, first?)
     }
 
-    /// Data sent at `sent_at` was not acknowledged; returns when it is retransmitted, if that was not
-    /// known yet.
+    /// Handles a missing acknowledgement of data sent at `sent_at`; returns the retransmission time, if it is new.
     pub(super) fn schedule_retransmission(&mut self, now: Instant, sent_at: Instant) -> Option<Instant> {
         if self.retransmit_at.is_some() {
             return None;
@@ -199,7 +199,7 @@ impl Pipe {
         Some(at)
     }
 
-    /// Retransmits what was lost.
+    /// Retransmits lost data.
     pub(super) fn retransmit(&mut self, now: Instant, gate: &mut Gate, way: Way) -> Retransmission {
         if self.dead || self.retransmit_at != Some(now) {
             return Retransmission::Nothing;
@@ -236,7 +236,7 @@ impl Pipe {
         self.newest = Instant::ZERO;
     }
 
-    /// The sender receives an acknowledgement; returns whether it covers more than the one before.
+    /// Handles an acknowledgement; returns whether it covers more than the previous one.
     pub(super) fn acknowledge(&mut self, now: Instant, upto: u64) -> bool {
         let is_news = upto > self.acked;
         if is_news {
@@ -261,11 +261,11 @@ impl Pipe {
 const INITIAL_RTO: Duration = Duration::from_secs(1);
 /// The retransmission timeout after data has arrived. Each retransmission doubles it.
 const MIN_RTO: Duration = Duration::from_millis(200);
-/// A connection that would need a longer one is given up.
+/// Maximum retransmission timeout; beyond it the connection is given up.
 const MAX_RTO: Duration = Duration::from_secs(16);
-/// Number of bytes that a program reads at once, rounded up to a segment.
+/// Maximum number of bytes per read of a program, rounded up to a segment.
 const MAX_READ: usize = 16 * 1024;
-/// When TCP gives up a connection on which nothing is acknowledged.
+/// Time without acknowledgements after which TCP gives up a connection.
 pub const TCP_TIMEOUT: Duration = Duration::from_secs(30);
 /// The gateway's transport gives up a connection on which nothing was acknowledged for this long.
 pub(super) const USER_TIMEOUT: Duration = Duration::from_secs(2);

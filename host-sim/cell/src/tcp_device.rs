@@ -1,6 +1,7 @@
-//! Devices of ports that are TCP connections: their end of the connection.
+//! Devices of ports that are TCP connections: the device's end of the connection.
 //!
-//! The gateway's end, and all faults of the network, are those of every link ([`super::network`], [`super::faults`]).
+//! The gateway's end and all faults of the network are the same as for every link ([`super::network`],
+//! [`super::faults`]).
 
 use proto_core::engine::LinkId;
 use proto_core::time::{Duration, Instant};
@@ -18,7 +19,7 @@ pub(super) struct TcpDevice {
     /// Its connection.
     conn: Option<u64>,
     is_off: bool,
-    /// Since when the gateway could have had a connection and had none; `None` if it has one, or could not.
+    /// Since when the gateway could have had a connection but has none; `None` if it has one or could not.
     missed_since: Option<Instant>,
 }
 
@@ -36,11 +37,11 @@ impl TcpDevice {
 }
 
 impl Cell {
-    /// Attaches a device to a link of Modbus TCP; it replaces the previous one. Without one, connections are there and
-    /// nobody answers.
+    /// Attaches a device to a Modbus TCP link; it replaces the previous device. Without a device, connections are
+    /// accepted but nobody replies.
     ///
     /// # Panics
-    /// If the link is to no device.
+    /// If the link does not lead to a device.
     #[track_caller]
     pub fn attach_server(&mut self, link: LinkId, server: impl Server + 'static) {
         match self.servers.get_mut(&link) {
@@ -50,7 +51,7 @@ impl Cell {
         self.note_deadlines();
     }
 
-    /// What happens with the device of a link; then its log is read.
+    /// Calls the device of a link, then reads its log.
     fn with_server(&mut self, link: LinkId, act: impl FnOnce(&mut dyn Server)) {
         let device = self.servers.get_mut(&link).and_then(|device| device.server.as_mut());
         let Some(server) = device else { return };
@@ -67,7 +68,7 @@ impl Cell {
         }
     }
 
-    /// Whether a connection is the one that the device has, and its link.
+    /// The link of a connection, if the connection is the one that the device has.
     fn device_of(&self, id: u64) -> Option<LinkId> {
         let link = self.conns.get(&id).map(|conn| conn.link);
         link.filter(|link| self.servers.get(link).is_some_and(|device| device.conn == Some(id)))
@@ -78,7 +79,7 @@ impl Cell {
         let Some(device) = self.servers.get_mut(&link) else { return };
         device.missed_since = None;
         if let Some(before) = device.conn.replace(id) {
-            // The gateway has left it: it has one at a time.
+            // The gateway has left the old connection: it only has one at a time.
             self.drop_conn(before);
             let now = self.now;
             self.with_server(link, |server| server.closed(now));
@@ -87,7 +88,7 @@ impl Cell {
         self.with_server(link, |server| server.opened(now));
     }
 
-    /// The device's end of a connection is gone.
+    /// The device loses its end of a connection.
     pub(super) fn device_loses(&mut self, id: u64) {
         let Some((&link, device)) = self.servers.iter_mut().find(|(_, device)| device.conn == Some(id))
         else {
@@ -167,7 +168,7 @@ impl Cell {
         }
     }
 
-    /// The end of what the far end sends has reached the gateway, which closes its end.
+    /// The far end's close has reached the gateway, which closes its end.
     pub(super) fn gateway_hears_end(&mut self, id: u64) {
         let delay = self.conns.get(&id).map(|conn| conn.link).map(|link| self.gate(link).network.delay);
         let Some(conn) = self.conns.get_mut(&id) else { return };
@@ -175,12 +176,12 @@ impl Cell {
             self.drop_conn(id);
             return;
         }
-        // It is not closed at the far end, and what is on its way arrives there before the reset.
+        // The far end is still open, and data in flight arrives there before the reset.
         conn.abandoned = true;
         self.queue.push(self.now + delay.unwrap_or_default(), Due::ResetUp { conn: id });
     }
 
-    /// The gateway takes bytes off a device's connection: replies have arrived.
+    /// The gateway reads bytes of a device's connection: replies have arrived.
     pub(super) fn report_acts(&mut self, id: u64) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
@@ -208,7 +209,7 @@ impl Cell {
         }
     }
 
-    /// A fault of a link begins or ends: an attempt to connect may have failed by it.
+    /// A fault of a link begins or ends: it may have made a connection attempt fail.
     pub(super) fn device_link_fault(&mut self, link: LinkId) {
         if let Some(device) = self.servers.get_mut(&link) {
             device.missed_since = None;
@@ -216,19 +217,19 @@ impl Cell {
         self.device_link_changed(link);
     }
 
-    /// Something happens to a link: the judge is told if it is a device's.
+    /// Tells the judge about a change of a device's link.
     pub(super) fn device_link_changed(&mut self, link: LinkId) {
         if let Some(judge) = self.judge.as_mut().filter(|_| self.servers.contains_key(&link)) {
             judge.note_fault(self.now);
         }
     }
 
-    /// Whether a connection to a device is not what it should be.
+    /// Whether a connection to a device has a fault.
     pub(super) fn is_device_faulty(&self) -> bool {
         self.servers.keys().filter_map(|link| self.gates.get(link)).any(|gate| !self.is_sound(gate))
     }
 
-    /// For how long the gateway has had no connection to a device although it could.
+    /// How long the gateway has had no connection to a device although it could.
     pub(super) fn misses_device_for(&mut self) -> Duration {
         let (now, is_asleep) = (self.now, self.is_asleep());
         let mut longest = Duration::ZERO;
@@ -254,5 +255,5 @@ fn admits(gate: &Gate) -> bool {
     gate.connect_policy == ConnectPolicy::Open && !Way::BOTH.into_iter().any(|way| gate.is_cut(way))
 }
 
-/// A reply is at the gateway within this time, unless something is wrong.
+/// Maximum time for a reply to reach the gateway without a fault.
 const ON_ITS_WAY: Duration = Duration::from_millis(15);

@@ -115,7 +115,7 @@ impl Trace {
         }
     }
 
-    /// Takes whole words in little-endian order, so that the digest is the same on every machine.
+    /// Adds whole words in little-endian order: the digest is the same on every machine.
     fn mix(&mut self, word: u64) {
         self.digest = (self.digest.rotate_left(23) ^ word).wrapping_mul(ODD);
     }

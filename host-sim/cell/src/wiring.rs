@@ -1,4 +1,4 @@
-//! Which line, bus or link each port of the two configurations gets.
+//! Assigns a line, bus or link to each port of the two configurations.
 
 use proto_core::config::Bus;
 use proto_core::engine::{LinkId, PortId};

@@ -310,8 +310,8 @@ impl Total {
         self.fold(run, report.digest);
     }
 
-    /// The outcomes of events that were too rare in a long harsh run of all cells whose devices are judged, each with how
-    /// often it was counted. Empty for any other run.
+    /// The outcomes of events that were too rare, each with its count, in a long harsh run of all cells with judged
+    /// devices. Empty for any other run.
     pub fn rare_outcomes(&self, level: Level) -> Vec<(&'static str, u64)> {
         let spans = |kind| self.cells.iter().filter(move |(name, _)| Kind::of(name) == Some(kind));
         let span =
@@ -323,13 +323,13 @@ impl Total {
         OUTCOMES.into_iter().map(|name| (name, count(name))).filter(|(_, count)| *count < OFTEN).collect()
     }
 
-    /// Takes the digest of the next finished run into the hash.
+    /// Adds the digest of the next finished run to the hash.
     pub(super) fn fold(&mut self, run: usize, digest: u64) {
         self.hash = [run as u64, digest].into_iter().fold(self.hash, mix);
     }
 }
 
-/// How long each run is, and how many there are.
+/// The length and the number of runs.
 pub(super) fn split(span: Duration, cells: usize) -> (Duration, usize) {
     // Each cell gets a run, even if the span is short.
     let share = span.as_micros().div_ceil(cells.max(1) as u64).max(1);
@@ -341,10 +341,10 @@ fn mix(hash: u64, word: u64) -> u64 {
     (hash.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15)
 }
 
-/// In this much time of each judged cell every outcome of an event occurs often: a little less than the share of one
-/// cell in a day of all.
+/// In this much time of each judged cell, every outcome of an event occurs often. A little less than the share of one
+/// cell in a day of all cells.
 const LONG: Duration = Duration::from_secs(3_600);
-/// How often, at least.
+/// Minimum number of occurrences in [`LONG`].
 const OFTEN: u64 = 100;
 /// The part of a run that is in a cell's fingerprint.
 const SAMPLE: Duration = Duration::from_secs(1);

@@ -1,5 +1,5 @@
-//! How a device that is asked behaves: every few seconds otherwise, prompt, slow, late, refusing, dead, or with
-//! replies that are damaged.
+//! The behaviour of a polled device, which changes every few seconds: prompt, slow, late, refusing, dead, or with
+//! damaged replies.
 
 use proto_core::time::{Duration, Instant};
 
@@ -9,17 +9,17 @@ use crate::Rng;
 pub(super) enum Behaviour {
     Prompt,
     Slow,
-    /// Some replies come when they have been given up.
+    /// Some replies arrive after they have been given up.
     Late,
-    /// It refuses what it is asked, if it can.
+    /// It refuses requests, if it can.
     Refusing,
     /// One bit of some replies is wrong.
     Damaged,
     /// Some replies end too early.
     Short,
-    /// Some replies do not come.
+    /// Some replies are lost.
     Losing,
-    /// Some replies are those of another slave, or to other questions.
+    /// Some replies are those of another slave, or to other requests.
     Mistaken,
     /// Other bytes come before some replies.
     Noisy,
@@ -33,14 +33,14 @@ pub(super) struct Behaves {
     ends: Instant,
 }
 
-/// What another behaviour means for the device.
+/// The effect of a new behaviour on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Change {
     /// It has power.
     Alive,
     /// It loses its power.
     Dead,
-    /// It loses its power, for so long that it forgets what it was told.
+    /// It loses its power for so long that it forgets everything it was told.
     Forgets,
 }
 
@@ -77,7 +77,7 @@ impl Behaves {
         })
     }
 
-    /// How long it takes for a reply.
+    /// The delay of a reply.
     pub(super) fn delay(&self, timeout: Duration, rng: &mut Rng) -> Duration {
         let timeout = timeout.as_micros();
         Duration::from_micros(match self.like {
@@ -88,9 +88,9 @@ impl Behaves {
     }
 }
 
-/// A reply is at the master this long before three times the timeout, in microseconds: the time of a reply on a
-/// line, of others before it, and in an adapter that gathers bytes.
+/// A reply is at the master this long before three times the timeout, in microseconds: the time of a reply on a line,
+/// of other replies before it, and in an adapter that gathers bytes.
 const MARGIN: u64 = 45_000;
-/// After this long without power a device has forgotten what it was told. It has been asked often enough by
-/// then that the gateway knows that it was away.
+/// After this long without power, a device has forgotten everything it was told. By then it has missed enough requests
+/// for the gateway to know that it was away.
 const FORGETS_AFTER: Duration = Duration::from_millis(1_500);

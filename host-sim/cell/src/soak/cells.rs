@@ -1,4 +1,4 @@
-//! The cells that a soak runs unless it is given others.
+//! The default cells of a soak run.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -19,7 +19,7 @@ pub struct Scenario {
     pub gateway: Box<GatewayConfig>,
     /// The controller's configuration.
     pub controller: SimConfig,
-    /// The device whose acts are judged by its own log; `None` if the model watches the gateway.
+    /// The device that is judged by its own log; `None` if the model watches the gateway.
     pub judged: Option<crate::judge::Kind>,
 }
 
@@ -123,7 +123,7 @@ impl Scenario {
     }
 }
 
-/// FNV-1a over what is written.
+/// FNV-1a hash of written text.
 struct Fnv(u64);
 
 impl Write for Fnv {

@@ -78,12 +78,12 @@ pub struct Soak {
     start: Instant,
 }
 
-/// What happens at the robot.
+/// What happens at the robot during a run.
 #[derive(Debug)]
 enum Life {
-    /// Anything.
+    /// Random events.
     World(World),
-    /// A program that asks a device.
+    /// A program that polls a device.
     Program(Program),
 }
 
@@ -122,7 +122,7 @@ pub struct Report {
     pub writes: u64,
     /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
-    /// What became of events, where a device is judged.
+    /// Results of events, if a device is judged.
     pub outcomes: BTreeMap<&'static str, u64>,
     /// The first violation, and its time from the start.
     pub violation: Option<(Violation, Duration)>,
@@ -241,7 +241,7 @@ impl Soak {
     }
 }
 
-/// How a line delivers bytes; those that are gathered, after at most so many milliseconds.
+/// How a line delivers bytes; gathered bytes are delivered after at most `longest_ms`.
 fn vary_delivery(line: &mut Line, longest_ms: u64, level: Level, rng: &mut Rng) {
     line.chunking = match rng.below(5) {
         2 => Chunking::Gathered(Duration::from_millis(rng.between(1, longest_ms))),
@@ -254,12 +254,12 @@ fn vary_delivery(line: &mut Line, longest_ms: u64, level: Level, rng: &mut Rng) 
     }
 }
 
-/// How the line of a device that is judged delivers bytes.
+/// How the line of a judged device delivers bytes.
 fn prepare_line(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
     let Some(port) = config.ports.first().filter(|port| matches!(port.bus, Bus::Rs485(_))) else { return };
     let line = cell.line_of(&port.name);
     vary_delivery(cell.line(line), 8, level, rng);
-    // An adapter of which nobody has told that it gives back what is sent.
+    // An adapter that echoes although the configuration does not say so.
     cell.line(line).gives_back = level == Level::Harsh && rng.below(3) == 0;
 }
 

@@ -1,7 +1,7 @@
 //! What one machine ran of a batch, as a document; and one document of all of them.
 //!
-//! In: a batch that has ended, or the documents of its shares. Out: a [`Part`], plain data for serde. A share
-//! that is missing, is there twice or belongs to another batch is refused. Reads no files.
+//! In: a batch that has ended, or the documents of its shares. Out: a [`Part`], plain data for serde. Refuses a share
+//! that is missing, occurs twice or belongs to another batch. Reads no files.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -13,7 +13,7 @@ use super::batch::{Failure, split};
 use super::{Batch, Share, Total};
 use crate::{FaultKind, Invariant};
 
-/// A share of a batch and what came out.
+/// A share of a batch and its results.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Part {
@@ -27,7 +27,7 @@ pub struct Part {
     pub faults: String,
     /// Virtual time of the whole batch, in microseconds.
     pub virtual_us: u64,
-    /// The cells of the batch, in its order.
+    /// The cells of the batch, in order.
     pub cells: Vec<PartCell>,
     /// Which share this is, such as `2/3`.
     pub shard: String,
@@ -35,7 +35,7 @@ pub struct Part {
     pub wall_us: u64,
     /// The first run of the share.
     pub first_run: usize,
-    /// The digests of its runs in hexadecimal digits; `None` for a run that was not finished.
+    /// The digests of the runs in hexadecimal digits; `None` for an unfinished run.
     pub digests: Vec<Option<String>>,
     /// The sums of its finished runs.
     pub sums: Sums,
@@ -111,7 +111,7 @@ impl fmt::Display for NotOneBatch {
 impl std::error::Error for NotOneBatch {}
 
 impl Part {
-    /// What a batch that has ended came to. `chosen` says of each cell how it was chosen.
+    /// The results of a batch that has ended. `chosen` says for each cell how it was chosen.
     pub fn of(batch: &Batch, chosen: &[String], wall_us: u64) -> Self {
         let total = batch.total();
         let runs = batch.share_runs();
@@ -175,10 +175,10 @@ impl Part {
         Ok(total)
     }
 
-    /// One document of all shares, as if one machine had run them.
+    /// One document for all shares, as if one machine had run them.
     ///
     /// # Errors
-    /// [`NotOneBatch`] if a share is missing, incomplete or there twice, or if they are not of one batch.
+    /// [`NotOneBatch`] if a share is missing, is incomplete or occurs twice, or if the shares are not of one batch.
     pub fn merge(parts: &[Self]) -> Result<Self, NotOneBatch> {
         let of = |nth: usize, why: String| NotOneBatch { nth: Some(nth), why };
         let all = |why: &str| NotOneBatch { nth: None, why: why.to_owned() };
@@ -224,7 +224,7 @@ impl Part {
         Ok(merged)
     }
 
-    /// Why it is not of the same batch as the first of the documents.
+    /// Why the document is not of the same batch as the first one.
     fn differs_from(&self, first: &Self) -> Result<(), String> {
         if self.soak != FORMAT || self.version != VERSION {
             return Err(format!(

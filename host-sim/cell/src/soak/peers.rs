@@ -1,9 +1,9 @@
-//! Simulated devices with frames of their own, which are asked: all peers of a port, in one device.
+//! Simulated devices with frames of their own, which are polled: all peers of a port, in one device.
 //!
-//! In: the port's exchanges and a seed. Out: replies, most of them right and in time, and frames that
-//! nobody asked for. Each peer changes its behaviour every few seconds: prompt, slow, late, refusing,
-//! dead, or with replies that are damaged, cut short, lost, behind noise, or to another question. None
-//! takes three times its timeout for a reply, behind which no master could tell it from one to the next request.
+//! In: the port's exchanges and a seed. Out: replies, most of them correct and in time, and unsolicited frames. Each
+//! peer changes its behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged,
+//! truncated, lost, preceded by noise, or to another request. No reply takes three times its timeout or longer: no
+//! master could distinguish it from a reply to the next request.
 
 use proto_core::config::{DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Transaction};
 use proto_core::device::{Carrier, Probe};
@@ -22,13 +22,13 @@ pub(super) struct Peers {
     rng: Rng,
     peers: Vec<Peer>,
     asks: Vec<Ask>,
-    /// Frames that come unasked, those of the port's input part without an exchange.
+    /// Unsolicited frames: those of the port's input part without an exchange.
     unasked: Vec<(Option<usize>, Sends)>,
     next_unasked: Instant,
-    /// Bytes that are no request yet.
+    /// Bytes that are not a complete request yet.
     held: Vec<u8>,
     held_until: Instant,
-    /// Replies that are to leave, and when.
+    /// Replies to be sent, and when.
     leaving: Vec<(Instant, Made)>,
     done: Vec<SlaveDone>,
 }
@@ -42,7 +42,7 @@ struct Peer {
 /// One exchange with a request.
 #[derive(Debug)]
 struct Ask {
-    /// Its index on the port.
+    /// Index of the exchange on the port.
     exchange: usize,
     peer: usize,
     request: Request,
@@ -69,7 +69,7 @@ struct Sends {
     values: Vec<Scalar>,
 }
 
-/// What leaves.
+/// A frame to be sent.
 #[derive(Debug, Clone)]
 struct Made {
     id: Option<CanId>,
@@ -137,7 +137,7 @@ impl Peers {
         })
     }
 
-    /// A request came.
+    /// Handles a request.
     fn asked(&mut self, nth: usize, request: Vec<u8>, now: Instant) {
         let Self { rng, peers, asks, leaving, done, .. } = self;
         let (number, exchange) = (peers[asks[nth].peer].number, asks[nth].exchange);
@@ -169,14 +169,14 @@ impl Peers {
         let is_on_can = made.id.is_some();
         match behaves.like {
             _ if !happens => {}
-            // Nothing of this happens to frames on a bus, and nobody could see it without a checksum.
+            // Frames on a bus cannot be damaged like this, and without a checksum nobody could detect it.
             Behaviour::Damaged | Behaviour::Short | Behaviour::Noisy if is_on_can || !has_checksum => return,
             Behaviour::Damaged => made.bytes[rng.below(len) as usize] ^= 1 << rng.below(8),
             Behaviour::Short => made.bytes.truncate(rng.between(1, len - 1) as usize),
             Behaviour::Losing => return,
             Behaviour::Mistaken => {
                 let other = rng.below(asks.len() as u64) as usize;
-                // If it spoke as another device and late, no master could tell that from the other's reply.
+                // If it replied late as another device, no master could distinguish that from the other device's reply.
                 if other == nth || asks[other].peer != asks[nth].peer {
                     return;
                 }
@@ -193,7 +193,7 @@ impl Peers {
             _ => {}
         }
         if template.begins(&made.bytes) {
-            // A letter in the other case is no damage to a checksum of letters.
+            // A letter in the other case does not damage a checksum of letters.
             done.push(SlaveDone {
                 slave: number,
                 what: Done::Replied { exchange, frame: made.bytes.clone() },
@@ -202,7 +202,7 @@ impl Peers {
         leaving.push((now + delay, made));
     }
 
-    /// The exchange that bytes are the request of.
+    /// The exchange that has these bytes as its request.
     fn request_of(&self, id: Option<CanId>, bytes: &[u8]) -> Option<usize> {
         self.asks.iter().position(|ask| ask.request.is(id, bytes))
     }
@@ -337,7 +337,7 @@ impl Sends {
         Self { template, values }
     }
 
-    /// Time goes by: some values change. Returns the frame with them.
+    /// Changes some values, and returns the frame with them.
     fn next(&mut self, rng: &mut Rng) -> Made {
         for (value, content) in self.values.iter_mut().zip(&self.template.fields) {
             if rng.below(3) == 0 {
@@ -348,7 +348,7 @@ impl Sends {
     }
 }
 
-/// Longest pause between frames that nobody asked for.
+/// Maximum pause between unsolicited frames.
 const UNASKED: Duration = Duration::from_millis(500);
-/// Bytes that are no request after this long never become one.
+/// Incomplete bytes are discarded after this time.
 const SILENCE: Duration = Duration::from_millis(8);

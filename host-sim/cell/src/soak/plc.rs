@@ -1,7 +1,7 @@
 //! A simulated PLC: the master of a Modbus RTU line on which the gateway is a slave.
 //!
-//! In: the blocks of a port's recipe and a seed. Out: requests at random times, most of them for what the
-//! blocks have, some for what they have not, to other slaves, to all, or damaged.
+//! In: the blocks of a port's recipe and a seed. Out: requests at random times, most of them for data of the blocks,
+//! some for other data, to other slaves, broadcast, or damaged.
 
 use proto_core::config::{Bus, GatewayConfig, Port, Transaction};
 use proto_core::modbus::rtu::Table;
@@ -29,7 +29,7 @@ struct Block {
     first: u16,
     count: u16,
     is_written: bool,
-    /// What was written last.
+    /// The values of the newest write.
     values: Vec<u16>,
 }
 
@@ -39,12 +39,12 @@ enum Behaviour {
     /// It does not wait for replies.
     Hasty,
     Silent,
-    /// Some requests are wrong in one way or another.
+    /// Some requests are invalid in some way.
     Careless,
 }
 
 impl Plc {
-    /// The master of a port; `None` if the gateway is no slave there.
+    /// The master of a port; `None` if the gateway is not a slave there.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, rng: Rng) -> Option<Self> {
         let recipe = config.recipes.get(usize::from(port.recipe))?;
         let Bus::Rs485(line) = &port.bus else { return None };
@@ -149,14 +149,14 @@ impl Device<Vec<u8>> for Plc {
             match rng.below(10) {
                 0 => frame[rng.below(len) as usize] ^= 1 << rng.below(8),
                 1 => frame.truncate(rng.between(1, len) as usize),
-                // Without a silence between them, the newest counts.
+                // Without a silence between two requests, the newest one counts.
                 2 => frame = [&frame[..], &frame].concat(),
                 3 => frame = [sealed(&[self.slave % 247 + 1, 6, 0, 1, 0, 2]), frame].concat(),
                 4 => frame = [&[0, 0][..], &frame].concat(),
                 _ => {}
             }
         }
-        // A line gives such a byte while its direction changes.
+        // A line may produce such a byte when its direction changes.
         let false_byte = |rng: &mut Rng| match rng.below(8) {
             0 => vec![0],
             1 => vec![0xFF],

@@ -29,7 +29,7 @@ pub(super) struct RandomDevice {
     templates: Vec<Template>,
     /// The newest values, by template.
     values: Vec<Vec<Scalar>>,
-    /// The port's timeout; if frames with alive counters take turns, the part of it that one has.
+    /// The port's timeout, or the part of it for one of several alternating frames with alive counters.
     timeout: Duration,
     /// Time of a frame on the line.
     frame_time: Duration,

@@ -1,4 +1,4 @@
-//! A batch shared between machines: which runs belong to which of them.
+//! A batch that is shared between machines, and the runs of each machine.
 
 use std::fmt;
 use std::ops::Range;
@@ -17,7 +17,7 @@ impl Share {
         (1 <= nth && nth <= of && of <= MAX_SHARES).then_some(Self { nth, of })
     }
 
-    /// Its number, from 1.
+    /// Number of the share, from 1.
     pub const fn nth(self) -> usize {
         self.nth
     }
@@ -27,7 +27,7 @@ impl Share {
         self.of
     }
 
-    /// Its runs: neighbours, so that each share has all cells in turn if it has enough runs. Empty only if
+    /// The runs of the share. They are consecutive, so a share with enough runs has all cells in turn. Empty only if
     /// there are fewer runs than shares.
     pub fn runs(self, all: usize) -> Range<usize> {
         let border = |nth: usize| (all as u128 * nth as u128 / self.of as u128) as usize;
@@ -47,7 +47,7 @@ impl fmt::Display for Share {
     }
 }
 
-/// A text that is not a share.
+/// The text is not a share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NoShare;
 

@@ -97,7 +97,7 @@ fn shown(soak: &Soak, entry: &Entry) -> String {
     format!("{}{more}{says}", hex.join(" "))
 }
 
-/// A request in words; `None` if it is not a complete one.
+/// A request in words; `None` if it is incomplete.
 fn request(adu: &[u8]) -> Option<String> {
     let (transaction, pdu) = split(adu)?;
     let says = match Request::parse(pdu).ok()? {
@@ -115,7 +115,7 @@ fn request(adu: &[u8]) -> Option<String> {
     Some(format!("#{transaction}: {says}"))
 }
 
-/// A response in words; `None` if it is not a complete one.
+/// A response in words; `None` if it is incomplete.
 fn answer(adu: &[u8]) -> Option<String> {
     let (transaction, pdu) = split(adu)?;
     let (&code, rest) = pdu.split_first()?;

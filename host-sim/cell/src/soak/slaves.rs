@@ -1,9 +1,9 @@
-//! Simulated slaves of a Modbus RTU line: all slaves that a port asks, in one device.
+//! Simulated slaves of a Modbus RTU line: all slaves that a port polls, in one device.
 //!
-//! In: the port's exchanges and a seed. Out: replies, most of them right and in time. Each slave
-//! changes its behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are
-//! damaged, lost or under another slave's address. None takes three times its timeout for a reply, behind
-//! which no master could tell it from one to the next request (proto-core/docs/wire/modbus-rtu.md section 4).
+//! In: the port's exchanges and a seed. Out: replies, most of them correct and in time. Each slave changes its
+//! behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged, lost or under
+//! another slave's address. No reply takes three times its timeout or longer: no master could distinguish it from a
+//! reply to the next request (proto-core/docs/wire/modbus-rtu.md section 4).
 
 use std::collections::BTreeMap;
 
@@ -22,7 +22,7 @@ use crate::{Device, Done, Rng, SlaveDone};
 pub(super) struct Slaves {
     rng: Rng,
     slaves: Vec<OneSlave>,
-    /// Replies that are to leave, and when.
+    /// Replies to be sent, and when.
     leaving: Vec<(Instant, Vec<u8>)>,
     done: Vec<SlaveDone>,
 }
@@ -38,16 +38,16 @@ struct OneSlave {
     timeout: Duration,
 }
 
-/// The registers and coils that are asked for; others are refused.
+/// The registers and coils that are requested; others are refused.
 #[derive(Debug, Default)]
 struct Bank {
     coils: BTreeMap<u16, u16>,
     discrete: BTreeMap<u16, u16>,
     holding: BTreeMap<u16, u16>,
     input: BTreeMap<u16, u16>,
-    /// What only the master changes.
+    /// Registers and coils that only the master changes.
     written: Vec<(bool, u16)>,
-    /// The bits of registers that another master changes.
+    /// Bits of registers that another master changes.
     others: BTreeMap<u16, u16>,
     refuses: bool,
     read: std::cell::Cell<Option<(u16, u16)>>,
@@ -55,7 +55,7 @@ struct Bank {
 }
 
 impl Slaves {
-    /// The slaves of a port; `None` if it is no master of a Modbus line.
+    /// The slaves of a port; `None` if it is not a master of a Modbus line.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, rng: Rng) -> Option<Self> {
         let recipe = config.recipes.get(usize::from(port.recipe))?;
         let Bus::Rs485(line) = &port.bus else { return None };
@@ -90,7 +90,7 @@ impl Slaves {
         (!slaves.is_empty()).then_some(Self { rng, slaves, leaving: Vec::new(), done: Vec::new() })
     }
 
-    /// Lets a slave execute what it was asked.
+    /// Lets a slave execute a request.
     fn answer(&mut self, nth: usize, now: Instant) {
         let rng = &mut self.rng;
         let others: Vec<u8> = self.slaves.iter().map(|slave| slave.address).collect();
@@ -124,7 +124,7 @@ impl Slaves {
                 let other = others[rng.below(others.len() as u64) as usize];
                 reply = sealed(&[&[other], &reply[1..len - 2]].concat());
                 if other == address {
-                    // One that nobody has.
+                    // An address that no slave has.
                     reply[0] = 0xFE;
                 }
             }
@@ -181,7 +181,7 @@ impl Device<Vec<u8>> for Slaves {
 }
 
 impl OneSlave {
-    /// Does what another behaviour means.
+    /// Applies a change of behaviour.
     fn change(&mut self, change: Change) {
         if change == Change::Alive {
             return;
@@ -218,7 +218,7 @@ impl Bank {
         }
     }
 
-    /// Time goes by: some of what the slave measures has other values, and another master has written bits.
+    /// Changes some measured values, and bits that another master has written.
     fn change(&mut self, rng: &mut Rng) {
         for (address, bits) in self.others.iter().filter(|(_, bits)| **bits != 0) {
             let value = self.holding.entry(*address).or_default();
@@ -323,7 +323,7 @@ impl RegisterBank for Bank {
     }
 
     fn read_discrete(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
-        // Without a count, it asks only whether there is the function.
+        // Without a count, the request only checks that the function exists.
         if count == 0 { Ok(()) } else { self.bits(&self.discrete, address, count, packed) }
     }
 

@@ -30,18 +30,18 @@ pub(super) enum Content {
     Number { ty: ScalarType, most: f64 },
     /// A constant, or padding.
     Constant,
-    /// No element of the frame: the layout makes it.
+    /// Not an element of the frame: the layout computes it.
     Checksum,
-    /// A number that goes up with each frame, mostly by one, and from `max` to 0.
+    /// A number that increases with each frame, mostly by one, and goes from `max` to 0.
     Counter { max: u32 },
     /// Numbers that sometimes pick commands.
     Commands { ty: ScalarType, values: Vec<i64> },
-    /// A text, which is made of a random number; the frame's layout says how it ends.
+    /// A text made from a random number; the frame's layout says how it ends.
     Text { width: TextWidth, ignored: Vec<Vec<u8>>, capacity: usize },
 }
 
 impl Template {
-    /// A frame with an id is one of a bus.
+    /// A frame; with an id, it is a CAN frame.
     pub(super) fn new(
         config: &GatewayConfig,
         id: Option<CanId>,
@@ -52,7 +52,7 @@ impl Template {
         Self::carried(config, (carrier, id), delimiters, fields)
     }
 
-    /// A frame of a part that says itself what tells its frames apart.
+    /// A frame of a part that defines how its frames are separated.
     pub(super) fn of_part(config: &GatewayConfig, part: &StreamPart) -> Self {
         let is_cut = part.framing != Boundary::Fields || part.escape.is_some();
         let carrier = if is_cut { Carrier::Whole } else { Carrier::Stream };
@@ -73,7 +73,7 @@ impl Template {
         Self { head, tail, id, fields, device: device.flatten().map(Box::new) }
     }
 
-    /// The values at first.
+    /// The initial values.
     pub(super) fn zeros(&self) -> Vec<Scalar> {
         self.fields.iter().map(zero).collect()
     }
@@ -105,12 +105,12 @@ impl Template {
         bytes
     }
 
-    /// Whether it has an alive counter.
+    /// Whether the frame has an alive counter.
     pub(super) fn counts(&self) -> bool {
         self.fields.iter().any(|content| matches!(content, Content::Counter { .. }))
     }
 
-    /// Whether others can see damage.
+    /// Whether a receiver can detect damage.
     pub(super) fn has_checksum(&self) -> bool {
         self.fields.iter().any(|content| matches!(content, Content::Checksum))
     }
@@ -167,7 +167,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
 }
 
 impl Content {
-    /// The text of this number: mostly as long as there is room for, some longer, some empty.
+    /// A text for this number: mostly of full length, some longer, some empty.
     fn text(&self, number: u32) -> Vec<u8> {
         let Self::Text { width, ignored, capacity } = self else { return Vec::new() };
         let (kind, number) = (number % 16, number / 16);

@@ -11,12 +11,12 @@ use proto_core::wire::state::OperationMode;
 use crate::{Cell, Rng};
 use recipe_config::InitialTarget;
 
-/// Changes the variables that ports show, and the controller's state.
+/// Changes the variables used by ports, and the controller's state.
 #[derive(Debug)]
 pub(super) struct World {
     rng: Rng,
     shown: Vec<SysVar>,
-    /// Those that are the length of a text.
+    /// Variables that are the length of a text.
     lengths: Vec<SysVar>,
     next: Instant,
 }
@@ -54,7 +54,7 @@ impl World {
                 let var = self.shown[self.rng.below(self.shown.len() as u64) as usize];
                 let before = cell.controller().registers().var(var).as_f64();
                 let value = match var.ty() {
-                    // One bit at a time, so that each has its own edges.
+                    // One bit at a time, so each bit has its own edges.
                     ScalarType::Byte => {
                         let bit = 1 << self.rng.below(8);
                         f64::from((before as u8 ^ bit) & var.valid_bits())

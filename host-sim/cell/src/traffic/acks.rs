@@ -8,8 +8,8 @@ use crate::network::Way;
 use crate::tcp::{Retransmission, TCP_TIMEOUT, USER_TIMEOUT};
 
 impl Cell {
-    /// The gateway's transport gives up a connection on which nothing was acknowledged for too long. The
-    /// controller is not told.
+    /// The gateway's transport gives up a connection on which nothing was acknowledged for too long. The controller
+    /// does not learn of this.
     pub(crate) fn user_timeout(&mut self, id: u64) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
@@ -73,7 +73,7 @@ impl Cell {
         self.engine_input(Input::LinkAcked { link, left });
     }
 
-    /// Retransmits what was not acknowledged.
+    /// Retransmits unacknowledged data.
     pub(crate) fn retransmit(&mut self, id: u64, way: Way) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
@@ -122,7 +122,7 @@ impl Cell {
         let Some(conn) = self.conns.get_mut(&id) else { return };
         let Some(gate) = self.gates.get(&conn.link) else { return };
         if !std::mem::replace(&mut conn.owes_ack, true) {
-            // An answer that the controller sends at once carries the acknowledgement.
+            // A reply that the controller sends at once carries the acknowledgement.
             self.queue.push(now + gate.network.ack_delay, Due::AckLeaves { conn: id });
         }
     }

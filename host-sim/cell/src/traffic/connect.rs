@@ -95,7 +95,7 @@ impl Cell {
         let Some(conn) = self.conns.get(&id) else { return };
         let (link, peer) = (conn.link, conn.peer);
         if self.gate(link).is_cut(Way::Up) {
-            // It learns of it when it sends something, or by TCP's timeout.
+            // The controller learns of this when it sends something, or by TCP's timeout.
             self.queue.push(self.now + TCP_TIMEOUT, Due::TimedOut { conn: id });
             return;
         }
@@ -124,7 +124,7 @@ impl Cell {
         let Some(conn) = self.conns.get_mut(&id) else { return };
         conn.up.dead = true;
         conn.closing = true;
-        // If the gateway has closed its end too, nothing is left of the connection.
+        // If the gateway has closed its end too, the connection no longer exists.
         if self.gates.get(&conn.link).is_none_or(|gate| gate.conn != Some(id)) {
             self.drop_conn(id);
         }

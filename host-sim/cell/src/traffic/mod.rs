@@ -146,7 +146,7 @@ impl Cell {
             return;
         }
         if way == Way::Down && is_asleep && !conn.abandoned {
-            // It waits in the gateway's socket.
+            // The data waits in the gateway's socket.
             return;
         }
         let (arrived, acks) = conn.pipe(way).next_arrived(now);
@@ -236,5 +236,5 @@ impl Cell {
     }
 }
 
-/// Bytes that the controller keeps for one connection. Beyond that it resets the connection.
+/// Maximum number of bytes that the controller buffers for one connection. If there are more, it resets the connection.
 const CONTROLLER_BUFFER: u64 = 256 * 1024;
