@@ -23,8 +23,7 @@ impl Cell {
         &self.gateway
     }
 
-    /// Sets how many transmissions each line and bus keeps for inspection; initially
-    /// [`crate::MAX_HEARD`].
+    /// Sets how many transmissions each line and bus keeps for inspection; initially [`crate::MAX_HEARD`].
     pub fn keep_heard(&mut self, limit: usize) {
         self.lines.iter_mut().for_each(|line| line.keep_heard = limit);
         self.buses.iter_mut().for_each(|bus| bus.keep_heard = limit);
@@ -195,8 +194,7 @@ impl Cell {
         self.trace.keep(limit);
     }
 
-    /// The recording, in the format of `proto_core::record`; empty if the cell was not made with
-    /// [`Self::recorded`].
+    /// The recording, in the format of `proto_core::record`; empty if the cell was not made with [`Self::recorded`].
     pub fn into_recording(self) -> Vec<u8> {
         self.recorder.map_or_else(Vec::new, |mut recorder| {
             recorder.totals(&self.engine);

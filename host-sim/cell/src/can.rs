@@ -1,5 +1,4 @@
-//! A CAN bus: one port of the gateway or of the controller, and a device, which may simulate several
-//! nodes.
+//! A CAN bus: one port of the gateway or of the controller, and a device, which may simulate several nodes.
 
 use std::collections::VecDeque;
 

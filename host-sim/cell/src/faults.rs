@@ -64,8 +64,7 @@ impl Cell {
         }
     }
 
-    /// Everything sent in this direction is lost until [`Self::repair_way`] is called as often. TCP
-    /// retransmits it.
+    /// Everything sent in this direction is lost until [`Self::repair_way`] is called as often. TCP retransmits it.
     pub fn cut_way(&mut self, link: LinkId, way: Way) {
         self.note(link);
         self.gate(link).cuts[way as usize] += 1;
@@ -88,8 +87,7 @@ impl Cell {
         Way::BOTH.into_iter().for_each(|way| self.repair_way(link, way));
     }
 
-    /// Another program on the controller's host sends a datagram to a port where the gateway
-    /// listens.
+    /// Another program on the controller's host sends a datagram to a port where the gateway listens.
     pub fn stranger_sends(&mut self, link: LinkId, bytes: &[u8]) {
         self.note(link);
         let due = Due::ClientDatagramDown { link, from: Sender::Stranger, bytes: bytes.to_vec() };
@@ -113,8 +111,7 @@ impl Cell {
         self.gates.get(&link).is_some_and(|gate| gate.conn.is_some())
     }
 
-    /// The next state packet lacks its first bytes, and the connection continues: all later packets
-    /// are misaligned.
+    /// The next state packet lacks its first bytes, and the connection continues: all later packets are misaligned.
     pub fn lose_state_bytes(&mut self, count: usize) {
         self.note(LinkId::STATE);
         self.state_bytes_lost = count;
@@ -193,8 +190,7 @@ impl Cell {
         self.buses[bus.0].connected = true;
     }
 
-    /// The port's CAN controller goes bus-off: its waiting frames are lost, and it receives
-    /// nothing.
+    /// The port's CAN controller goes bus-off: its waiting frames are lost, and it receives nothing.
     pub fn bus_off(&mut self, bus: BusId) {
         self.buses[bus.0].drop_port_frames();
         self.buses[bus.0].is_off = true;
@@ -236,8 +232,7 @@ impl Cell {
         self.controller_started();
     }
 
-    /// The controller loses power: its ends of all connections are gone without notice.
-    /// [`Self::power_up`] ends it.
+    /// The controller loses power: its ends of all connections are gone without notice. [`Self::power_up`] ends it.
     pub fn power_cut(&mut self) {
         let links: Vec<LinkId> = self.controller_links().collect();
         links.into_iter().for_each(|link| self.cut_cable(link));
@@ -291,8 +286,7 @@ impl Cell {
         self.controller_started();
     }
 
-    /// The gateway loses power and restarts: its connections are reset, and its counters start at
-    /// 0.
+    /// The gateway loses power and restarts: its connections are reset, and its counters start at 0.
     pub fn restart_gateway(&mut self) {
         self.count_outcomes();
         if let Some(judge) = &mut self.judge {
@@ -344,8 +338,7 @@ impl Cell {
         links.into_iter()
     }
 
-    /// The links where the gateway listens for datagrams, each with the length of the controller's
-    /// frames.
+    /// The links where the gateway listens for datagrams, each with the length of the controller's frames.
     pub(super) fn listening_for_datagrams(&self) -> Vec<(LinkId, Option<usize>)> {
         let listen = self.gates.values().filter(|gate| matches!(gate.kind, LinkKind::RecipeUdpListen { .. }));
         listen.map(|gate| (gate.id, self.frame_len(gate.id))).collect()

@@ -192,8 +192,7 @@ enum Medium {
 }
 
 impl Cell {
-    /// A cell that is switched on now. Field ports have no devices yet. Links come up when time
-    /// advances.
+    /// A cell that is switched on now. Field ports have no devices yet. Links come up when time advances.
     ///
     /// # Errors
     /// [`CellError`] if the gateway or the controller cannot run its configuration.

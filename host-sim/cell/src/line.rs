@@ -137,8 +137,7 @@ impl Line {
         self.heard.drain(..).collect()
     }
 
-    /// Starts a transmission on the line; `each` gets the time at which each piece has arrived, in
-    /// order.
+    /// Starts a transmission on the line; `each` gets the time at which each piece has arrived, in order.
     pub(super) fn send(
         &mut self,
         now: Instant,

@@ -10,8 +10,7 @@ use super::rng::Rng;
 pub struct Network {
     /// Delay from one end to the other.
     pub delay: Duration,
-    /// Up to this much random delay is added to each segment or datagram. Segments keep their
-    /// order, datagrams do not.
+    /// Up to this much random delay is added to each segment or datagram. Segments keep their order, datagrams do not.
     pub jitter: Duration,
     /// Data sent on a connection is cut into segments of 1 to this many bytes, at random.
     pub longest_segment: Option<usize>,
@@ -21,11 +20,9 @@ pub struct Network {
     pub loss_ppm: u32,
     /// Number of datagrams per million that arrive twice.
     pub duplicate_ppm: u32,
-    /// The controller's TCP acknowledges this long after data has arrived, unless it sends
-    /// something before.
+    /// The controller's TCP acknowledges this long after data has arrived, unless it sends something before.
     pub ack_delay: Duration,
-    /// The gateway's driver reports acknowledgements this long after they arrive, and before it reports
-    /// received data.
+    /// The gateway's driver reports acknowledgements this long after they arrive, and before it reports received data.
     pub ack_report: Duration,
     /// Capacity of the gateway's transport for unacknowledged bytes. If it is exceeded, the driver reports a
     /// transmission as sent only once there is room again.

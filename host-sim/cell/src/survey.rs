@@ -11,9 +11,8 @@ use super::oracle::{Path, inputs_of};
 use recipe_controller::Link;
 
 impl Cell {
-    /// Announces that a server of the controller has a fault, such as
-    /// [`recipe_controller::Controller::mute`], so that the model expects less of the gateway. Call
-    /// [`Self::server_fault_ends`] as often.
+    /// Announces that a server of the controller has a fault, such as [`recipe_controller::Controller::mute`], so that
+    /// the model expects less of the gateway. Call [`Self::server_fault_ends`] as often.
     pub fn server_fault_begins(&mut self, server: Link) {
         self.server_faults[server as usize] += 1;
         self.note_fault(None);

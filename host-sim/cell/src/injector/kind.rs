@@ -97,8 +97,7 @@ impl FaultKind {
         Self::GatewaySleep,
     ];
 
-    /// Relative frequency. Faults that stop everything for long are rare, or there would be little
-    /// time for others.
+    /// Relative frequency. Faults that stop everything for long are rare, or there would be little time for others.
     pub(super) const fn weight(self) -> u64 {
         match self {
             Self::GatewaySleep | Self::PowerCut | Self::GatewayRestart | Self::Dialect => 1,

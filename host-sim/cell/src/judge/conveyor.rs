@@ -1,4 +1,5 @@
-//! The conveyor of `judged-modbus-tcp.toml`, which is told what the axis is, and the rack of inputs behind the same address.
+//! The conveyor of `judged-modbus-tcp.toml`, which is told what the axis is, and the rack of inputs behind the same
+//! address.
 
 use proto_core::time::{Duration, Instant};
 

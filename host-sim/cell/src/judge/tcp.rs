@@ -1,5 +1,5 @@
-//! A Modbus TCP server with orders and questions of its own, written from the specification: the header, one or more units
-//! behind it, and what servers do wrong.
+//! A Modbus TCP server with orders and questions of its own, written from the specification: the header, one or more
+//! units behind it, and what servers do wrong.
 
 use proto_core::time::{Duration, Instant};
 

@@ -10,8 +10,7 @@ use super::wire::{Asked, Inputs};
 use super::{Invariant, Oracle};
 
 impl Oracle {
-    /// The controller has received bytes on a connection, which changed its inputs from `before` to
-    /// `after`.
+    /// The controller has received bytes on a connection, which changed its inputs from `before` to `after`.
     pub(crate) fn arrived(
         &mut self,
         conn: u64,

@@ -228,8 +228,7 @@ fn crc_of(crc: &Crc, bytes: impl Iterator<Item = u8>) -> u32 {
     result ^ crc.xorout
 }
 
-/// The number that a field sends for one of its source, by what stands behind the field; `None` if nothing is
-/// sent.
+/// The number that a field sends for one of its source, by what stands behind the field; `None` if nothing is sent.
 pub(super) fn sent_for(encoding: &Encoding, number: f64, behind: &[FieldSpec]) -> Option<f64> {
     let is_whole = encoding.is_integer();
     match behind.first() {

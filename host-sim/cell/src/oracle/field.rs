@@ -50,8 +50,7 @@ pub(super) struct Accepted {
     pub bits: Vec<Coils>,
     /// Reserved bits were set.
     pub masked: bool,
-    /// Values of command fields: the field's index in the frame, its table, when it picks a command, and the
-    /// value.
+    /// Values of command fields: the field's index in the frame, its table, when it picks a command, and the value.
     pub commands: Vec<(usize, Span, CommandWhen, i64)>,
     /// The alive counters, each with the place of its field.
     pub counts: Vec<((usize, usize), u32)>,

@@ -82,8 +82,7 @@ impl Oracle {
         self.robot.no_longer_asked(|command| commands.is_asked(command), now);
     }
 
-    /// Finds the links that the engine has given up by itself. `reported` is the link of the input, which
-    /// handles it.
+    /// Finds the links that the engine has given up by itself. `reported` is the link of the input, which handles it.
     pub(super) fn find_lost_links(&mut self, engine: &Engine, reported: Option<LinkId>, now: Instant) {
         let mut left = self.up.are_up;
         while left != 0 {

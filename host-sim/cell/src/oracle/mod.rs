@@ -1,5 +1,4 @@
-//! Checks the gateway's promises at every step against an independent model (docs/cell.md section
-//! 4).
+//! Checks the gateway's promises at every step against an independent model (docs/cell.md section 4).
 //!
 //! In: all inputs and outputs of the engine, and what reaches the controller. Out: how often each
 //! [`Invariant`] was checked, and the first [`Violation`]. The model is slow and simple: it finds
@@ -68,8 +67,7 @@ struct LinkWatch {
     line: LineWatch,
     stream: stream::Stream,
     busy: bool,
-    /// Number of bytes sent since the link came up, in total and up to the end of each
-    /// unacknowledged transmission.
+    /// Number of bytes sent since the link came up, in total and up to the end of each unacknowledged transmission.
     total: u64,
     unacked: VecDeque<u64>,
 }
@@ -157,8 +155,7 @@ impl Oracle {
             after_stall: false,
             remembered: 0,
             outputs: 0,
-            // Per port one frame of each id, per link one open or close and one transmission, and one
-            // more command.
+            // Per port one frame of each id, per link one open or close and one transmission, and one more command.
             max_outputs: parts as u32 + 1 + 2 * (4 + spec.links.len() as u32),
             frames: vec![(0, 0); spec.ports.len()],
             traffic: [(0, 0); LINKS],
@@ -169,8 +166,7 @@ impl Oracle {
         }
     }
 
-    /// Begins with a cell that is switched on: its ports are up, and the engine expects a tick at
-    /// `announced`.
+    /// Begins with a cell that is switched on: its ports are up, and the engine expects a tick at `announced`.
     pub(super) fn begin(&mut self, engine: &Engine, announced: Instant, now: Instant) {
         self.called_at = Some(now);
         self.announced = announced;
@@ -350,8 +346,7 @@ impl Oracle {
         }
     }
 
-    /// The engine has nothing to do before `until`. `pending` is the number of events and connections
-    /// in the cell.
+    /// The engine has nothing to do before `until`. `pending` is the number of events and connections in the cell.
     pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, pending: usize) {
         if self.violation.is_some() {
             return;

@@ -1,5 +1,4 @@
-//! Safe values: repeated until the controller is known to have them (proto-core/docs/engine.md section
-//! 6).
+//! Safe values: repeated until the controller is known to have them (proto-core/docs/engine.md section 6).
 
 use proto_core::engine::LinkId;
 use proto_core::sysvar::SysVar;
@@ -92,8 +91,7 @@ impl Upward {
         now >= self.unconfirmed_at + SHOWN_AFTER
     }
 
-    /// Confirms the safe values that the packet shows. Soon after a confirmation, another value revokes
-    /// it.
+    /// Confirms the safe values that the packet shows. Soon after a confirmation, another value revokes it.
     pub(super) fn compare_safe(&mut self, spec: &Spec, packet: &[u8], now: Instant) {
         let may_confirm = self.may_confirm(now);
         let may_revoke = self.confirmed_at.is_some_and(|at| now < at + REVOCABLE);

@@ -1,5 +1,4 @@
-//! What the configuration specifies: owners, ways up and sources (proto-core/docs/engine.md section 4),
-//! computed once.
+//! What the configuration specifies: owners, ways up and sources (proto-core/docs/engine.md section 4), computed once.
 //!
 //! Written from that page, independent of the engine's plan.
 
@@ -373,8 +372,7 @@ fn link_spec(config: &GatewayConfig, id: LinkId, recipe: &Recipe, is_datagram: b
     LinkSpec { id, is_datagram, input, output, reads_back: false, not_after: Duration::ZERO }
 }
 
-/// Whether one field frame has all variables of the link's frame, with safe values for all of them or for
-/// none.
+/// Whether one field frame has all variables of the link's frame, with safe values for all of them or for none.
 fn is_one_frame(ports: &[PortSpec], owned: &[Option<Owned>; COUNT], link: &LinkSpec) -> bool {
     let Some(up) = &link.input else { return true };
     ports.iter().enumerate().filter(|(_, port)| port.is_field).any(|(nth, port)| {

@@ -1,5 +1,4 @@
-//! The packets in the state stream (proto-core/docs/wire/state.md section 3, D8), judged by their decoded
-//! fields.
+//! The packets in the state stream (proto-core/docs/wire/state.md section 3, D8), judged by their decoded fields.
 
 use proto_core::wire::state::StatePacket;
 

@@ -88,8 +88,7 @@ pub(super) enum Carried {
     Safe,
     /// The controller holds it already, as far as is known, since the last frame of its overdue owner.
     Held { accepted: Instant },
-    /// It came at this time, in its owner's frame or from the state stream, and may have this age when it
-    /// is sent.
+    /// It came at this time, in its owner's frame or from the state stream, and may have this age when it is sent.
     Of { arrived: Instant, timeout: Duration },
 }
 

@@ -225,8 +225,7 @@ pub(super) fn registers(words: Words, text: &[u8]) -> Option<Vec<(SysVar, Raw)>>
     Some(vars.collect())
 }
 
-/// The text that registers have: up to the first zero, or of so many characters; `None` if there is no room
-/// for these.
+/// The text that registers have: up to the first zero, or of so many characters; `None` if there is no room for these.
 pub(super) fn text_of(
     words: Words,
     raw: impl Fn(SysVar) -> Option<Raw>,

@@ -189,8 +189,7 @@ impl Batch {
         scenarios.get((seed % scenarios.len().max(1) as u64) as usize)
     }
 
-    /// Runs until all are done, one fails, or [`Batch::stop`] is called. Several threads may call
-    /// it at once.
+    /// Runs until all are done, one fails, or [`Batch::stop`] is called. Several threads may call it at once.
     pub fn work(&self) {
         while !self.stop.load(Relaxed) {
             let run = self.next.fetch_add(1, Relaxed);

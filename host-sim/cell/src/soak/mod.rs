@@ -1,9 +1,8 @@
 //! Soak runs: hours of cells in virtual time with random faults, and every step of the gateway checked
 //! (docs/cell.md sections 4 and 5).
 //!
-//! In: cells, a seed, a level of faults, virtual time. Out: a [`Total`], the same for the same seed on
-//! every machine and for any number of threads, or the first violation and how to repeat it. Does not
-//! print: `host-sim soak` does.
+//! In: cells, a seed, a level of faults, virtual time. Out: a [`Total`], the same for the same seed on every machine
+//! and for any number of threads, or the first violation and how to repeat it. Does not print: `host-sim soak` does.
 
 mod batch;
 mod behaviour;

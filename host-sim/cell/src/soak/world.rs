@@ -1,5 +1,4 @@
-//! Random events at the controller while a cell runs: inputs change, programs set registers, someone
-//! presses a button.
+//! Random events at the controller while a cell runs: inputs change, programs set registers, someone presses a button.
 
 use proto_core::config::{FieldSpec, GatewayConfig};
 use proto_core::engine::Plan;

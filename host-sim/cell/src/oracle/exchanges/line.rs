@@ -1,8 +1,7 @@
 //! The exchanges of one line or bus: the request on its way, its reply, and who is asked when
 //! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Exchanges").
 //!
-//! It does not predict which request is next: it says which ones may be sent, which must not, and how
-//! long none may be.
+//! It does not predict which request is next: it says which ones may be sent, which must not, and how long none may be.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -619,8 +618,7 @@ impl ExchangesWatch {
         }
         let mut flight = self.flight.take()?;
         if flight.may_be_echo && !flight.is_wrong {
-            // Nobody knows. It is not a failure.
-            // What came may have been the echo, and the replies are still to come.
+            // Nobody knows. It is not a failure. What came may have been the echo, and the replies are still to come.
             let until = flight.sent? + spec.late;
             self.rest(spec.pause, now);
             let watch = &mut self.rows[flight.row];

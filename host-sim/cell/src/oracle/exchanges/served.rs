@@ -1,6 +1,5 @@
-//! A port on which the gateway is a Modbus slave: what a master's requests lead to
-//! (proto-core/docs/wire/modbus-rtu.md section 6 and modbus.md sections 3 to 5, docs/configuration.md
-//! section 4, "Modbus RTU slave").
+//! A port on which the gateway is a Modbus slave: what a master's requests lead to (proto-core/docs/wire/modbus-rtu.md
+//! section 6 and modbus.md sections 3 to 5, docs/configuration.md section 4, "Modbus RTU slave").
 //!
 //! Written from these pages, independent of the engine's slave.
 

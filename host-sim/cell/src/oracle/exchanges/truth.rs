@@ -270,8 +270,7 @@ impl Truth {
         self.were_had(spec, &spec.ports[nth], row, values, at, stalled(at))
     }
 
-    /// Checks that the controller had the values of a request together, at most as long before it as is
-    /// promised.
+    /// Checks that the controller had the values of a request together, at most as long before it as is promised.
     fn were_had(
         &self,
         spec: &Spec,

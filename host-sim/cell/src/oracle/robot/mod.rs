@@ -451,8 +451,7 @@ fn not_after(spec: &Spec, link: LinkId) -> Duration {
 
 /// A command arrives within this time after it was picked.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
-/// An urgent command is sent within 1 s after the device last requested it, and acknowledged within
-/// another.
+/// An urgent command is sent within 1 s after the device last requested it, and acknowledged within another.
 const URGENT_TTL: Duration = Duration::from_secs(2);
 /// Parts of a transmission that is split into segments arrive at least a microsecond apart.
 const ALLOWANCE: Duration = Duration::from_millis(2);

@@ -353,8 +353,7 @@ impl RowSpec {
         self.reply_data().map_or(self.repeated() + 2, |len| len + 5)
     }
 
-    /// The data of a request, as its fields have it: one coil in the lowest bit. Of a device's own frame,
-    /// all of it.
+    /// The data of a request, as its fields have it: one coil in the lowest bit. Of a device's own frame, all of it.
     pub(in crate::oracle) fn data_of(&self, request: &[u8]) -> Vec<u8> {
         if self.frames.is_some() {
             return request.to_vec();
