@@ -1,4 +1,4 @@
-//! The loader's program.
+//! The loader's program: chooses a slot and jumps to its firmware.
 
 use core::fmt;
 use core::panic::PanicInfo;
@@ -9,7 +9,8 @@ use recipe_update::{BoardName, Machine, PublicKey, Slot, choose};
 
 use crate::board::{self, Area, BOARD};
 
-/// Public key of the firmware, behind a mark, at a fixed address (loader.x) where the firmware reads it.
+/// The public key that firmware must be signed with, preceded by a mark. It is at a fixed address (loader.x), where the
+/// firmware reads it too.
 #[unsafe(link_section = ".update_key")]
 #[used]
 static KEY: MarkedKey = MarkedKey { mark: *b"RGUK", key: include!(concat!(env!("OUT_DIR"), "/key.rs")) };
@@ -48,7 +49,7 @@ struct MountedStore {
     flash: Area,
 }
 
-/// Mounts the store. A board with one bank has one place for it.
+/// Mounts the store. A board with one flash bank has only one place for it.
 fn mount((first, second): (Area, Option<Area>)) -> Option<MountedStore> {
     let Some(second) = second else {
         return Some(MountedStore { store: Store::mount(&first).ok()?, flash: first });
@@ -79,7 +80,7 @@ impl Machine for LoaderBoard {
 
     fn mark(&mut self, marks: SlotMarks) -> bool {
         let Some(MountedStore { store, flash }) = &mut self.store else { return false };
-        // The future only waits for the flash, whose operations block.
+        // The future never pends: it waits only for the flash, whose operations block.
         store.mark_slots(marks).is_ok_and(|put| block_on(put.execute(flash)).is_ok())
     }
 
@@ -91,8 +92,9 @@ impl Machine for LoaderBoard {
 /// Jumps to the firmware.
 fn run(vectors: u32) -> ! {
     board::leave();
-    // SAFETY: the image was checked, and nothing of the loader is used afterwards. The image begins with its vector
-    // table, aligned for the 166 vectors of the STM32H743 and the fewer ones of QEMU's board.
+    // SAFETY: `choose` has checked the image that begins at this address, and nothing of the loader is used after the
+    // jump. The image begins with its vector table, whose alignment suffices for the 166 vectors of the STM32H743 and
+    // the fewer vectors of QEMU's board.
     unsafe {
         (*cortex_m::peripheral::SCB::PTR).vtor.write(vectors);
         cortex_m::asm::dsb();
@@ -101,7 +103,7 @@ fn run(vectors: u32) -> ! {
     }
 }
 
-/// Waits for the watchdog's reset, like a fault.
+/// Waits until the watchdog resets the board, as after a fault.
 #[panic_handler]
 fn panic(_: &PanicInfo<'_>) -> ! {
     loop {

@@ -1,4 +1,4 @@
-//! The boards: their registers, and nothing that decides which slot runs.
+//! The boards: access to their registers. Which slot runs is not decided here.
 
 #[cfg(feature = "board-mps2-an500")]
 mod mps2_an500;

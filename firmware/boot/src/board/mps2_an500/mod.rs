@@ -1,5 +1,5 @@
-//! QEMU's `mps2-an500`: slots and store are files of the host, a slot runs from the RAM for programs that it is copied
-//! to, and the log is on UART 3.
+//! QEMU's `mps2-an500`: slots and store are files on the host. The chosen slot is copied to program RAM and runs there.
+//! The log is on UART 3.
 
 #[path = "../../../../src/board/mps2_an500/arguments.rs"]
 mod arguments;
@@ -21,7 +21,7 @@ use recipe_update::{Chosen, IMAGE_OFFSET, Slot, SlotFlash};
 use arguments::FileName;
 pub(crate) use host_flash::HostFlash as Area;
 
-/// Runs before anything is read.
+/// Starts the watchdog and the console, before any flash is read.
 pub(crate) fn start() {
     watchdog::start();
     console::start();
@@ -30,7 +30,7 @@ pub(crate) fn start() {
 /// The slots, A first.
 ///
 /// # Safety
-/// To be called once, as on the other board.
+/// Must be called at most once. (Required by the other board; the signature is common to both.)
 pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
     let open = |slot: Slot| {
         let name = FileName::argument(SLOTS)?;
@@ -46,7 +46,7 @@ pub(crate) unsafe fn slots() -> Option<[Area; 2]> {
 /// The place for the store.
 ///
 /// # Safety
-/// To be called once, as on the other board.
+/// Must be called at most once. (Required by the other board; the signature is common to both.)
 pub(crate) unsafe fn stores() -> Option<(Area, Option<Area>)> {
     let store = Area::open(&FileName::argument(STORE)?, 0, STORE_SECTORS)?;
     Some((store, None))
@@ -72,8 +72,8 @@ pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
         let place = FlashWord { sector, word: u16::try_from(word.checked_rem(words)?).ok()? };
         let bytes = slot.whole(place)?;
         let address = start.checked_add(nth.checked_mul(WORD as u32)?)?;
-        // SAFETY: program RAM within the slot, as the header was checked to be for this slot. The loader lies before
-        // the slots, and nothing else lies in them.
+        // SAFETY: the address is in program RAM, within the slot: the check of the header ensured that the image fits
+        // into this slot. The loader itself is located before the slots, and nothing else uses their RAM.
         unsafe { core::ptr::with_exposed_provenance_mut::<[u8; WORD]>(address as usize).write(bytes) }
     }
     let trial = if chosen.is_trial { " on trial" } else { "" };
@@ -81,12 +81,13 @@ pub(crate) fn load(chosen: &Chosen, slots: &[Area; 2]) -> Option<u32> {
     Some(start)
 }
 
-/// Prepares for the firmware. The watchdog keeps running: a firmware that hangs before it feeds it has used a start.
+/// Feeds the watchdog before the jump to the firmware. The watchdog keeps running: a firmware that hangs before its
+/// first feed is reset, and has used up one start of its trial.
 pub(crate) fn leave() {
     watchdog::feed();
 }
 
-/// No slot can run: waits forever.
+/// Reports that no slot can run, and waits forever.
 pub(crate) fn nothing_runs() -> ! {
     say(format_args!("no slot holds a firmware that can run"));
     loop {
@@ -96,7 +97,7 @@ pub(crate) fn nothing_runs() -> ! {
     }
 }
 
-/// The arguments with the names of the files. The firmware has them too.
+/// Indices of the semihosting arguments with the names of the files. The firmware uses the same indices.
 const STORE: usize = 3;
 const SLOTS: usize = 5;
 const STORE_SECTORS: u8 = 2;

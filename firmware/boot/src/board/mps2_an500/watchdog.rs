@@ -1,7 +1,7 @@
 //! The watchdog: a counter that raises a non-maskable interrupt at its first zero and resets the machine at its second.
 //!
-//! It runs from the first instruction of the loader on and during the start of the firmware, so a firmware on trial that
-//! hangs before it sets up its own watchdog is reset too.
+//! The loader starts it first, and it keeps running while the firmware starts. So a firmware on trial that hangs before
+//! it sets up its own watchdog is reset too.
 
 use super::registers::{WATCHDOG, write};
 
@@ -12,7 +12,7 @@ const LOCK: u32 = WATCHDOG + 0xC00;
 const UNLOCK: u32 = 0x1ACC_E551;
 /// Interrupt and reset enabled.
 const CONTROL_ON: u32 = 0b11;
-/// Cycles of 25 MHz until the counter is zero: 4 s, as the firmware has it.
+/// Cycles of 25 MHz until the counter is zero: 4 s, as in the firmware.
 const HALF: u32 = 100_000_000;
 
 /// Starts the watchdog with a timeout of 8 s.

@@ -1,8 +1,8 @@
 //! The flash of slots and stores. RM0433, "Embedded Flash memory".
 //!
-//! A word that a power cut has torn has no valid error correction code, and reading it is a bus fault, so each word
-//! is first read once with bus faults ignored. Writing to the bank that the loader runs from stalls the core, which
-//! does not matter here.
+//! If power is cut during a write, the word may be left without a valid error correction code. Reading such a torn word
+//! causes a bus fault, so each word is first read once with bus faults ignored. Writing to the bank that the loader
+//! runs from stalls the core, which does not matter here.
 
 use core::sync::atomic::{Ordering, fence};
 
@@ -36,7 +36,7 @@ impl Area {
         Self { sectors: [first, second, second, second, second], count: 2 }
     }
 
-    /// Address of a word; that of the first sector if the sector does not exist.
+    /// Address of a word. A sector that does not exist is replaced by the first one.
     fn address(&self, FlashWord { sector, word }: FlashWord) -> usize {
         let [first, ..] = self.sectors;
         let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
@@ -49,7 +49,8 @@ const _: () = assert!(BOARD.slot_sectors == 5);
 impl SlotFlash for Area {
     fn whole(&self, place: FlashWord) -> Option<Word> {
         let address = self.address(place);
-        // SAFETY: a word of flash that was just found readable; nothing writes it meanwhile.
+        // SAFETY: the address is that of an aligned word of flash. `can_read` has just found it readable, and nothing
+        // writes to it in between, because the loader has only one thread of execution.
         can_read(address)
             .then(|| unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() })
     }
@@ -72,7 +73,8 @@ impl Flash for Area {
         barrier();
         let start = core::ptr::with_exposed_provenance_mut::<u32>(address);
         for (nth, part) in word.as_chunks().0.iter().enumerate() {
-            // SAFETY: within one word of this area's flash, which only this area writes; the bank is unlocked.
+            // SAFETY: `nth` is below 8, so the address is within one flash word of this area. No other `Area` of
+            // this flash exists (see `slot` and `store`), and its bank was unlocked for programming above.
             unsafe { start.add(nth).write_volatile(u32::from_le_bytes(*part)) }
         }
         barrier();
@@ -103,7 +105,8 @@ struct FlashBank {
 impl FlashBank {
     fn of(address: usize) -> Self {
         let base = FLASH_REGISTERS + if address as u32 & BANK == 0 { 0 } else { 0x100 };
-        // SAFETY: registers of the flash interface; only this module writes them.
+        // SAFETY: the offsets below are 32-bit registers of the flash interface. Reading them has no effect, and only
+        // this module writes to them.
         let at = |offset: usize| unsafe { Register::at(base + offset) };
         Self { keys: at(0x04), control: at(0x0C), status: at(0x10), clear: at(0x14) }
     }
@@ -113,7 +116,7 @@ impl FlashBank {
         if self.control.read() & LOCK != 0 {
             KEYS.into_iter().for_each(|key| self.keys.write(key));
         }
-        // Error flags of reading a torn word would block the operation.
+        // Error flags left by reading a torn word would block the operation.
         self.clear.write(ALL_FLAGS);
     }
 
@@ -121,8 +124,8 @@ impl FlashBank {
         self.control.write(value);
     }
 
-    /// Waits for the bank, then locks it. A hang ends by the watchdog; a failed operation is found when the word is
-    /// read back.
+    /// Waits until the bank is ready, then locks it. If it never is, the watchdog resets the board. A failed operation
+    /// is found when the word is read back.
     fn finish(&self) {
         while self.status.read() & BUSY != 0 {}
         self.clear.write(ALL_FLAGS);
@@ -137,7 +140,7 @@ fn barrier() {
 }
 
 const FLASH_REGISTERS: usize = 0x5200_2000;
-/// The bit of an address in the second bank, and the size of a bank.
+/// Size of a bank, and the address bit that selects the second bank.
 const BANK: u32 = 0x10_0000;
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 /// Clears all flags of a bank.
@@ -145,7 +148,7 @@ const ALL_FLAGS: u32 = 0x0FEF_0000;
 const LOCK: u32 = 1;
 const PROGRAM: u32 = 1 << 1;
 const ERASE_SECTOR: u32 = 1 << 2;
-/// 64 bits at a time: the supply is 3.3 V.
+/// Parallelism of programming: 64 bits, which the supply of 3.3 V allows.
 const FASTEST: u32 = 3 << 4;
 const BEGIN: u32 = 1 << 7;
 const BUSY: u32 = 1 | 1 << 2;

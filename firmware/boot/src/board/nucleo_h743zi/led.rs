@@ -1,19 +1,20 @@
-//! LD3, the red LED, at PB14: no slot can run.
+//! LD3, the red LED, at PB14. It blinks if no slot can run.
 
 use super::register::Register;
 use super::watchdog;
 
-// SAFETY: RCC_AHB4ENR; nothing else runs while the loader does.
+// SAFETY: the address of RCC_AHB4ENR, a 32-bit register; reading it has no effect. Only this module of the loader
+// writes to it, and the firmware does not run yet.
 const CLOCKS: Register = unsafe { Register::at(0x5802_44E0) };
-// SAFETY: GPIOB_MODER; only this module writes it.
+// SAFETY: the address of GPIOB_MODER, a 32-bit register; reading it has no effect, and only this module writes to it.
 const MODE: Register = unsafe { Register::at(0x5802_0400) };
-// SAFETY: GPIOB_BSRR; only this module writes it.
+// SAFETY: the address of GPIOB_BSRR, a 32-bit register; reading it has no effect, and only this module writes to it.
 const SET: Register = unsafe { Register::at(0x5802_0418) };
 
 const GPIOB: u32 = 1 << 1;
 const PIN: u32 = 14;
 const OUTPUT: u32 = 1;
-/// At least a quarter of a second at 64 MHz.
+/// Delay in cycles: at least a quarter of a second at 64 MHz.
 const QUARTER: u32 = 16_000_000;
 
 /// Blinks once or twice a second forever: only a debug probe can recover the board.
