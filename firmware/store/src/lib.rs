@@ -13,19 +13,19 @@
 //! Storage that survives restarts and power cuts: configurations, a key, settings, counters (docs/store.md).
 //!
 //! In: the words of some sectors of flash, and records to store. Out: words to write and sectors to erase, and the
-//! stored records. Knows neither the chip nor the contents of a configuration.
+//! stored records. Does not know the chip or the contents of a configuration.
 //!
-//! Made for flash whose words have an error correction code and are written once after an erase. A power cut
-//! leaves the word that was being written in one of three states: it cannot be read, or it reads as something
-//! between old and new, or it looks blank and takes no write. The store keeps what it had before, or has what
-//! was written, whole, in each of them.
+//! It is made for flash whose words have an error correction code and can be written once after an erase. After a power
+//! cut, the word that was being written is in one of three states: it cannot be read, it reads as a mix of old and new,
+//! or it looks blank but cannot be written. In each case the store has either the complete old record or the complete
+//! new one.
 //!
 //! [`Store::mount`] reads the flash. A [`Put`] changes it, as a state machine: [`Put::next`] returns the next flash
 //! operation until it ends, so the same code serves blocking and asynchronous flash. [`Put::execute`] is the loop for
 //! an asynchronous [`Flash`].
 //!
-//! A board whose program can be updated has two places for a store, because flash cannot be read while a sector of the
-//! same bank is erased: [`newest`] finds the valid one, a [`Move`] changes the place.
+//! Flash cannot be read while a sector of the same bank is being erased, so a board whose program can be updated has
+//! two places for a store, one in each bank. [`newest`] finds the valid store; a [`Move`] copies it to the other place.
 //!
 //! ```
 //! # use recipe_store::{Flash, FlashWord, Geometry, Word};
@@ -97,13 +97,13 @@ pub struct FlashWord {
 /// Size of the flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Geometry {
-    /// Number of sectors: at least 2, at most 8. One of them is always free for the next turn.
+    /// Number of sectors: at least 2, at most 8. One of them is always free for the next sector to be begun.
     pub sectors: u8,
     /// Number of words in each: at least 8.
     pub words: u16,
 }
 
-/// Flash for a [`Store`] or for a slot of the firmware, and for nothing else.
+/// Flash used only for a [`Store`] or for a slot of the firmware.
 ///
 /// Writing and erasing may take seconds, so they are futures; a program without other tasks blocks on them. They report
 /// no errors: failures are found when the words are read back.
@@ -111,11 +111,11 @@ pub trait Flash {
     /// Size of the flash; constant.
     fn geometry(&self) -> Geometry;
 
-    /// The bytes of a word; zeros if it cannot be read, because it was torn by a power cut. It never fails: an
-    /// error at one word would make all others unreachable.
+    /// The bytes of a word; zeros if it cannot be read because it was torn by a power cut. Reading never fails, because
+    /// an error at one word would make all others unreachable.
     fn read(&self, place: FlashWord) -> Word;
 
-    /// Writes a word that was not written since its sector was erased.
+    /// Writes a word that has not been written since its sector was erased.
     fn write(&mut self, place: FlashWord, word: &Word) -> impl Future<Output = ()>;
 
     /// Erases a sector.

@@ -25,7 +25,7 @@ pub struct FoundRecord {
     pub data: FlashWord,
     /// Length of the data in bytes.
     pub len: usize,
-    /// Value stored in the head.
+    /// Value stored in the head of the record; its meaning depends on the key.
     pub tag: u64,
     pub(crate) sequence: u32,
 }
@@ -34,7 +34,7 @@ pub struct FoundRecord {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum MountError {
-    /// It was written by a newer program. It is left unchanged.
+    /// The store was written by a newer program. It is left unchanged.
     Version {
         /// The version found.
         found: u32,
@@ -59,8 +59,8 @@ impl fmt::Display for MountError {
 impl core::error::Error for MountError {}
 
 impl Store {
-    /// Reads the whole flash; flash without a store is an empty store. Writes nothing: the next write skips what a
-    /// power cut left behind.
+    /// Reads the whole flash. Flash without a store counts as an empty store. Nothing is written: the next write skips
+    /// the words that a power cut left incomplete.
     ///
     /// # Errors
     /// The flash is unsuitable, or a newer program wrote it.
@@ -70,12 +70,12 @@ impl Store {
             return Err(MountError::Geometry(geometry));
         }
         let mut store = Self::empty(geometry, 1);
-        // In the order in which they were begun: the later copy of a record is the valid one, because the sector of the
-        // earlier one is erased next.
+        // Sectors are read in the order in which they were begun. Of two copies of a record the later one is valid,
+        // because the sector of the earlier one is erased next.
         while let Some((sector, sequence)) = store.begun_next(flash)? {
             let end = store.walk(flash, sector);
             store.head = Some((sector, sequence));
-            // The next word may only look blank.
+            // Skip one word: it may look blank and yet not take a write.
             store.end = end.saturating_add(1);
         }
         Ok(store)
@@ -86,7 +86,7 @@ impl Store {
         Self { geometry, head: None, end: 0, sequence, index: [None; KEYS] }
     }
 
-    /// The sector that was begun next after `head`. (Sorting would be 6 KiB of code.)
+    /// The sector that was begun next after `head`. (Sorting the sectors would take 6 KiB of code.)
     fn begun_next(&self, flash: &impl Flash) -> Result<Option<(u8, u32)>, MountError> {
         let mut next: Option<(u8, u32)> = None;
         for sector in 0..self.geometry.sectors {
@@ -104,7 +104,7 @@ impl Store {
         Ok(next)
     }
 
-    /// Takes the records of a sector into the index; returns the first word behind everything that was written.
+    /// Enters the records of a sector into the index. Returns the first word behind everything that was written.
     fn walk(&mut self, flash: &impl Flash, sector: u8) -> u16 {
         let (mut word, mut end) = (1, 1);
         while word < self.geometry.words {
@@ -119,7 +119,7 @@ impl Store {
                         self.enter(place, &head);
                     }
                 }
-                // An incomplete record takes its words too: they are data, not heads of records.
+                // Also skip the words of an incomplete record: they are data and must not be taken for heads.
                 word = word.saturating_add(head.extent());
                 end = word;
             } else {
@@ -154,7 +154,7 @@ impl Store {
         self.index.get(usize::from(code)).copied().flatten()
     }
 
-    /// The same record, copied to begin at this place.
+    /// Notes that the record of the key with this code was copied and now begins at this place.
     pub(crate) fn moved(&mut self, code: u8, FlashWord { sector, word }: FlashWord) {
         if let Some(Some(found)) = self.index.get_mut(usize::from(code)) {
             found.data = FlashWord { sector, word: word.saturating_add(1) };
@@ -166,7 +166,8 @@ impl Store {
         self.entry(key.code()?)
     }
 
-    /// Copies its data to the beginning of `out`; `None` if there is no record or `out` is too short.
+    /// Copies the data of a key's newest record to the beginning of `out`; `None` if there is no record or `out` is too
+    /// short.
     pub fn get<'o>(&self, flash: &impl Flash, key: RecordKey, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let found = self.find(key)?;
         let out = out.get_mut(..found.len)?;
@@ -180,9 +181,10 @@ impl Store {
         Some(out)
     }
 
-    /// Number of words of all records, and the limit when one of `extent` words is added.
+    /// Number of words of all records, and the limit of it if a record of `extent` words is to be added.
     ///
-    /// One sector is free, and the new record fits behind what is needed in at least one of the others.
+    /// Up to the limit, one sector can stay free, and at least one of the others has space for the new record behind
+    /// the records that are still needed.
     pub(crate) fn used(&self, extent: u16) -> (u32, u32) {
         let used = self.index.iter().flatten().map(|found| u32::from(crate::record::extent(found.len))).sum();
         let sector = self.geometry.words.saturating_sub(1).saturating_sub(extent);

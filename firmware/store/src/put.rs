@@ -1,9 +1,10 @@
 //! Writes a record.
 //!
-//! Records are written one behind the other in one sector. When it is full, the next one of the ring is erased.
-//! The records that are still needed in the sector behind that are copied into it, and only then it gets its
-//! head: so a power cut before leaves everything as it was, and the sector behind is free for the next turn.
-//! Nothing that is needed is ever in a sector that is being erased.
+//! Records are written one behind the other into the current sector. The sectors form a ring. When the current sector
+//! is full, the next one is erased. The sector behind the next one is the oldest in use: its records that are still
+//! needed are copied into the next one, whose head is written last. Until the head is written, a power cut leaves
+//! everything as it was; afterwards the oldest sector is free, to be erased when the new current sector is full. So a
+//! sector that is being erased never contains a record that is needed.
 
 use core::fmt;
 
@@ -11,8 +12,8 @@ use crate::mount::is_whole;
 use crate::record::{KEYS, MAX_DATA, RecordHead, SectorHead, part, sum};
 use crate::{BLANK, Flash, FlashWord, FoundRecord, RecordKey, Store, Word};
 
-/// A record being written. Dropped before its end, it leaves either the old or the new record. A flash operation that
-/// was begun must end before the next one.
+/// A record being written. If it is dropped before its end, either the old or the new record is valid. Each flash
+/// operation must be complete before the next one begins.
 #[must_use = "nothing is written until `next` or `execute` is called"]
 #[derive(Debug)]
 pub struct Put<'s, 'd> {
@@ -26,14 +27,14 @@ pub(crate) struct Work {
     head: RecordHead,
     phase: PutPhase,
     writing: WordWriter,
-    /// Next free word of the sector that is the target of copying.
+    /// Next free word of the sector that records are copied into.
     fill: u16,
     /// Words of the copies, by key.
     copies: [u16; KEYS],
     /// Remaining attempts to begin a sector.
     turns: u8,
     tries: u8,
-    /// A sector that is blank is not erased again before it is begun.
+    /// All sectors have been erased: a blank sector is not erased again before it is begun.
     is_erased: bool,
 }
 
@@ -44,7 +45,7 @@ pub enum PutStep {
     Erase(u8),
     /// Write a word.
     Write(FlashWord, Word),
-    /// The end. Until a put has ended without an error the old record is valid, afterwards the new one.
+    /// The end. The old record is valid until the put ends without an error; from then on the new one is.
     End(Result<(), PutError>),
 }
 
@@ -66,9 +67,9 @@ pub enum PutError {
     },
     /// No such key.
     Key,
-    /// The sector does not become blank, or its head cannot be written.
+    /// The sector is not blank after an erase, or its head cannot be written.
     Sector(u8),
-    /// The words that were written read differently, at several places.
+    /// At several places, words read differently from what was written.
     Worn,
 }
 
@@ -101,7 +102,7 @@ enum PutPhase {
     Erased {
         tries: u8,
     },
-    /// Copy the record of this key if the sector behind has it, and those of all later keys.
+    /// Copy the record of this key if it is in the oldest sector; then do the same for all later keys.
     Copy {
         key: u8,
     },
@@ -169,7 +170,7 @@ impl Store {
         }
         let head = RecordHead { key: code, sequence: self.sequence, len, tag, sum: sum(data) };
         let work = self.begin(head)?;
-        // Even if it fails: its words may later be read as a record.
+        // The number is used up even if the write fails, because the written words may later be read as a record.
         self.sequence = self.sequence.saturating_add(1);
         Ok(Put { store: self, data, work })
     }
@@ -194,7 +195,7 @@ impl Store {
 }
 
 impl Put<'_, '_> {
-    /// Returns the next step; called again when that is done, until [`PutStep::End`].
+    /// Returns the next step. Call it again when that step is done, until it returns [`PutStep::End`].
     pub fn next<F: Flash>(&mut self, flash: &F) -> PutStep {
         self.work.next(self.store, &RecordSource::<F>::Bytes(self.data), flash)
     }
@@ -202,7 +203,7 @@ impl Put<'_, '_> {
     /// Executes all steps.
     ///
     /// # Errors
-    /// Why the record was not written; the previous one remains.
+    /// The record was not written; the previous one remains.
     pub async fn execute(mut self, flash: &mut impl Flash) -> Result<(), PutError> {
         loop {
             match self.next(flash) {
@@ -358,7 +359,7 @@ impl Work {
                         head.word(),
                     ));
                 }
-                // Data only after a readable head, or it could be taken for records.
+                // Data is written only behind a readable head. Otherwise it could be taken for records.
                 WordWriter::CheckHead { at } => {
                     if flash.read(FlashWord { sector, word: at }) == head.word() {
                         self.set_end(store, into, at.saturating_add(head.extent()));
@@ -389,7 +390,7 @@ impl Work {
         }
     }
 
-    /// Retries behind the words written so far, if attempts remain.
+    /// Prepares a retry behind the words written so far; returns whether an attempt was left.
     fn again(&mut self) -> bool {
         let Some(left) = self.tries.checked_sub(1) else { return false };
         self.tries = left;
@@ -425,6 +426,6 @@ fn behind(store: &Store, sector: u8) -> u8 {
     if next < store.geometry.sectors { next } else { 0 }
 }
 
-/// Limit of rewrites after failed verification. A power cut may cause one, at a word that only looks blank; several
-/// cuts at the same place cause one each.
+/// Maximum number of rewrites after failed verification. A power cut can cause one, by leaving a word that only looks
+/// blank. Several power cuts at the same place cause one each.
 const TRIES: u8 = 8;

@@ -1,7 +1,7 @@
 //! The words of the store: the heads of sectors and of records.
 //!
-//! A record is a head word, its data in whole words (the last one filled up with zeros), and the head word
-//! again as its end. The end is written last: it says that the power was still there after the data.
+//! A record is a head word, its data in whole words (the last one filled up with zeros), and a copy of the head word as
+//! its end. The end is written last: it shows that the data was written completely before any power cut.
 
 use crc::{CRC_32_ISO_HDLC, Crc, Digest, NoTable};
 
@@ -12,7 +12,7 @@ pub const MAX_DATA: usize = 16 * 1024;
 /// Number of counters.
 pub const COUNTERS: u8 = 3;
 pub(crate) const KEYS: usize = 18;
-/// Version of the store's layout; others are not read.
+/// Version of the store's layout. A store with another version is not read.
 pub const VERSION: u32 = 1;
 
 const SECTOR_MAGIC: [u8; 4] = *b"RGSs";
@@ -33,7 +33,7 @@ pub enum RecordKey {
     Adopted,
     /// A counter, below [`COUNTERS`].
     Counter(u8),
-    /// The settings of the edge node. To a program that knows nothing of it, it is a counter that is copied along.
+    /// The settings of the edge node. A program without an edge node treats the record as a counter and copies it.
     Edge,
     /// Which slots of the firmware are good and on trial.
     Slots,
@@ -63,18 +63,18 @@ impl RecordKey {
 pub(crate) struct RecordHead {
     /// Code of the key.
     pub(crate) key: u8,
-    /// Higher than that of all records written before; a copy keeps it.
+    /// Sequence number: higher than those of all records written before. A copy of a record keeps its number.
     pub(crate) sequence: u32,
     /// Length of the data in bytes.
     pub(crate) len: u32,
-    /// Value whose meaning depends on the key; small records have no data.
+    /// Value whose meaning depends on the key. Small records consist of it alone, without data.
     pub(crate) tag: u64,
     /// CRC-32 of the data, filled up to whole words.
     pub(crate) sum: u32,
 }
 
 impl RecordHead {
-    /// The head in a word; `None` if it is not one.
+    /// Decodes a head; `None` if the word is not one.
     pub(crate) fn parse(word: &Word) -> Option<Self> {
         let (words, _) = word.as_chunks::<4>();
         let &[magic, sequence, key, len, low, high, sum, check] = words else { return None };
@@ -112,7 +112,7 @@ impl RecordHead {
     }
 }
 
-/// Number of words of a record with so many bytes of data.
+/// Number of words of a record with `len` bytes of data, including head and end.
 pub(crate) fn extent(len: usize) -> u16 {
     u16::try_from(len.div_ceil(WORD)).map_or(u16::MAX, |data| data.saturating_add(2))
 }
@@ -120,7 +120,7 @@ pub(crate) fn extent(len: usize) -> u16 {
 pub(crate) enum SectorHead {
     /// A sector of this layout.
     Known {
-        /// Higher than that of all sectors that were begun before.
+        /// Sequence number: higher than those of all sectors that were begun before.
         sequence: u32,
     },
     /// A sector of another layout.
@@ -186,5 +186,5 @@ pub(crate) fn sum(data: &[u8]) -> u32 {
     digest.finalize()
 }
 
-/// Without a table: it would cost 1 KiB of flash and save some milliseconds of the start.
+/// Without a table, which would take 1 KiB of flash and shorten the start by only a few milliseconds.
 static CRC: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);

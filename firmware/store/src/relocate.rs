@@ -1,8 +1,8 @@
 //! Moves a store to another place of the flash.
 //!
-//! A board with two slots has a place for the store in each bank, and uses the one in the bank that it does not run
-//! from. A move erases the new place, copies all records, and writes the number of the move last: until then the old
-//! place is valid, and an interrupted move is restarted. The old place is not written.
+//! A board with two slots has a place for the store in each flash bank. It uses the place in the bank that it does not
+//! run from. A move erases the new place, copies all records, and writes the number of the move last. Until then the
+//! old place, which is never written to, is valid, and an interrupted move is restarted.
 
 use crate::mount::MountError;
 use crate::put::{RecordSource, Work, head_of, is_blank};
@@ -12,9 +12,9 @@ use crate::{Flash, FoundRecord, PutError, PutStep, RecordKey, Store};
 /// One of two places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Side {
-    /// The first one, which also holds stores that were never moved.
+    /// The first place. A store that was never moved is here.
     First,
-    /// The second one.
+    /// The second place.
     Second,
 }
 
@@ -29,10 +29,10 @@ pub struct Newest {
     pub may_move: bool,
 }
 
-/// Reads both places: the target of the last move is valid; without any move, the first.
+/// Reads both places. The target of the last move is valid; if there was no move, the first place.
 ///
 /// # Errors
-/// Neither is usable: the error of the first.
+/// Neither place is usable. The error is that of the first.
 pub fn newest(first: &impl Flash, second: &impl Flash) -> Result<Newest, MountError> {
     match (Store::mount(first), Store::mount(second)) {
         (Ok(one), Ok(other)) if one.generation() >= other.generation() => {
@@ -45,7 +45,7 @@ pub fn newest(first: &impl Flash, second: &impl Flash) -> Result<Newest, MountEr
     }
 }
 
-/// A store being moved. Dropped or interrupted before its end, it leaves the store where it was.
+/// A store being moved. If it is dropped or interrupted before its end, the store remains where it was.
 #[must_use = "nothing is moved until `next` or `execute` is called"]
 #[derive(Debug)]
 pub struct Move<'s> {
@@ -64,7 +64,7 @@ enum RelocatePhase {
         sector: u8,
         tries: u8,
     },
-    /// The record of this key, and then those of all later ones.
+    /// Copy the record of this key, then those of all later keys.
     Key(u8),
     Copying {
         key: u8,
@@ -76,7 +76,7 @@ enum RelocatePhase {
 }
 
 impl Store {
-    /// Write the number of moves.
+    /// Number of times that the store was moved.
     pub fn generation(&self) -> u64 {
         self.find(RecordKey::Generation).map_or(0, |found| found.tag)
     }
@@ -89,7 +89,8 @@ impl Store {
 }
 
 impl Move<'_> {
-    /// Returns the next step for the new place; called again when that is done, until [`PutStep::End`].
+    /// Returns the next step for the new place. Call it again when that step is done, until it returns
+    /// [`PutStep::End`].
     pub fn next<F: Flash>(&mut self, from: &impl Flash, to: &F) -> PutStep {
         loop {
             match &mut self.phase {
@@ -137,7 +138,7 @@ impl Move<'_> {
         }
     }
 
-    /// The first record from this key on, or the number of the move behind all others.
+    /// Begins to copy the first record from this key on. Behind the last one comes the number of the move.
     fn record(&mut self, from: &impl Flash, first: u8) -> Result<RelocatePhase, PutError> {
         let is_copied = |key: &u8| RecordKey::Generation.code() != Some(*key);
         let found = (first..KEYS as u8).filter(is_copied).find_map(|key| Some((key, self.from.entry(key)?)));
@@ -161,14 +162,14 @@ impl Move<'_> {
     /// Executes all steps; returns the store in its new place.
     ///
     /// # Errors
-    /// Why the move failed; the old place remains valid.
+    /// The move failed; the old place remains valid.
     pub fn execute(
         self,
         from: &impl Flash,
         to: &mut impl Flash,
     ) -> impl Future<Output = Result<Store, PutError>> {
         let mut relocation = self;
-        // The future of an async function would hold it twice.
+        // An async block, because the future of an async function would hold `self` twice.
         async move {
             loop {
                 match relocation.next(from, to) {

@@ -12,7 +12,7 @@ pub const MAX_REVISIONS: usize = 8;
 pub struct Revision {
     /// Number of the revision; increases with each one.
     pub number: u32,
-    /// Distinguishes contents of the same number; not computed by the store.
+    /// Distinguishes different contents of the same number. The caller computes it, not the store.
     pub digest: u32,
     /// Length of its image in bytes.
     pub len: usize,
@@ -33,7 +33,7 @@ pub struct Marks {
     pub live: Option<u32>,
     /// Number of the previously live configuration.
     pub previous: Option<u32>,
-    /// The one on trial.
+    /// The configuration on trial.
     pub trial: Option<Trial>,
     /// Number of the configuration whose trial ended last, and how.
     pub last: Option<(u32, TrialEnd)>,
@@ -56,7 +56,7 @@ pub enum TrialEnd {
     NotConfirmed,
     /// It was rolled back.
     TakenBack,
-    /// It did not run, or used up its starts.
+    /// The configuration or firmware on trial did not run, or used up its starts.
     Failed,
 }
 
@@ -88,7 +88,7 @@ pub struct Trial {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum KeepError {
-    /// It cannot be written.
+    /// The record cannot be written.
     Put(PutError),
     /// The configuration to be forgotten or replaced is marked.
     Needed {
@@ -137,9 +137,9 @@ pub enum Role {
 /// Candidates at a start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Start {
-    /// Marks to write before anything runs: the trial has one start less, or is over.
+    /// Marks to write before anything runs: they count a start of the trial, or end it.
     pub marks: Option<Marks>,
-    /// Candidates in order; the first that can run is run.
+    /// Candidates in order; the first one that can run is to be run.
     pub candidates: heapless::Vec<(Revision, Role), 3>,
 }
 
@@ -317,7 +317,7 @@ impl Store {
     }
 }
 
-/// Identifies an adopted image.
+/// Digest and length of an adopted image, as stored in its record.
 fn adopted(digest: u32, len: usize) -> u64 {
     u64::from(digest) << 32 | u64::from(u32::try_from(len).unwrap_or(u32::MAX))
 }

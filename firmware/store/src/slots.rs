@@ -1,9 +1,9 @@
-//! Slots: which of the two places of the firmware is good, and which one is on trial (docs/update.md).
+//! Firmware slots: which of the two is good, and which is on trial (docs/update.md).
 
 use crate::revisions::TrialEnd;
 use crate::{Put, PutError, RecordKey, Store};
 
-/// Place of a firmware. Each image is linked for one slot.
+/// One of the two places for firmware. Each image is linked for one slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Slot {
     /// The first one.
@@ -16,7 +16,7 @@ impl Slot {
     /// Both slots, A first.
     pub const ALL: [Self; 2] = [Self::A, Self::B];
 
-    /// The other one.
+    /// The other slot.
     pub fn other(self) -> Self {
         match self {
             Self::A => Self::B,
@@ -24,7 +24,7 @@ impl Slot {
         }
     }
 
-    /// 0 or 1, in that order.
+    /// Number of the slot: 0 for A, 1 for B.
     pub fn number(self) -> u8 {
         match self {
             Self::A => 0,
@@ -41,9 +41,9 @@ impl Slot {
 /// Marks of the slots, written atomically.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SlotMarks {
-    /// The slot that was confirmed last, or the first one.
+    /// The slot that was confirmed last; if there was none, the first slot that was run.
     pub good: Option<Slot>,
-    /// The one on trial.
+    /// The trial, if a slot is on trial.
     pub trial: Option<SlotTrial>,
     /// The slot whose trial ended last, and how.
     pub last: Option<(Slot, TrialEnd)>,
@@ -78,7 +78,7 @@ impl Store {
     /// Marks slots.
     ///
     /// # Errors
-    /// The marks cannot be written; those before count.
+    /// The marks cannot be written; the previous marks remain valid.
     pub fn mark_slots(&mut self, marks: SlotMarks) -> Result<Put<'_, 'static>, PutError> {
         let number = |slot: Option<Slot>| slot.map_or(NO_SLOT, Slot::number);
         let (attempts, confirm_s, before) =

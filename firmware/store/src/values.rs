@@ -3,7 +3,7 @@
 use crate::{Flash, FoundRecord, Put, PutError, RecordKey, Store};
 
 impl Store {
-    /// The key of the API; `None` if the board was not claimed.
+    /// The access key of the API; `None` if the board has not been claimed.
     pub fn access_key(&self, flash: &impl Flash) -> Option<[u8; 16]> {
         let mut key = [0; 16];
         let len = self.get(flash, RecordKey::Access, &mut key)?.len();
