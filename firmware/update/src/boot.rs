@@ -8,7 +8,7 @@ use crate::SlotFlash;
 use crate::check::{BadImage, Check, header};
 use crate::header::{BoardName, Header, PublicKey};
 
-/// Starts that a trial has: one, and two more after power cuts.
+/// Number of starts that a trial has: one, and two more in case of power cuts.
 pub const STARTS: u8 = 3;
 
 /// The loader's access to its board.
@@ -37,10 +37,11 @@ pub struct Chosen {
     pub is_trial: bool,
 }
 
-/// Chooses the slot to run: the one on trial if it has a start left, which is counted first; the good one; the other
-/// one. `None` if no slot can run. `marks` is `None` if there is no store; then nothing is on trial.
+/// Chooses the slot to run. The slot on trial comes first if it has a start left, which is counted before the slot is
+/// checked; then the good slot; then the other one. Returns `None` if no slot can run. `marks` is `None` if there is no
+/// store; then nothing is on trial.
 ///
-/// The good slot is checked for damage only, others also for their signature.
+/// The good slot is checked for damage only. The signature of other slots is checked too.
 pub fn choose(
     machine: &mut impl Machine,
     marks: Option<SlotMarks>,
@@ -62,7 +63,7 @@ pub fn choose(
     for slot in Slot::ALL.into_iter().filter(|slot| now.good != Some(*slot)) {
         match origin(machine.flash(slot), slot, board, key) {
             Ok(header) => {
-                // From now on it is the one to return to.
+                // From now on this slot is the one to fall back to.
                 if marks.is_some() {
                     machine.mark(SlotMarks { good: Some(slot), trial: None, ..now });
                 }
@@ -74,7 +75,7 @@ pub fn choose(
     None
 }
 
-/// The slot on trial, if it may be run. If not, the trial is over.
+/// Returns the slot on trial if it may run; otherwise ends the trial.
 fn on_trial(
     machine: &mut impl Machine,
     now: &mut SlotMarks,
@@ -90,7 +91,7 @@ fn on_trial(
         *now = failed;
         return None;
     };
-    // Counted before anything of it runs or is read: whatever goes wrong, it ends.
+    // The start is counted before the slot is read or run, so the trial ends whatever goes wrong.
     let counted = SlotMarks { trial: Some(SlotTrial { attempts, ..trial }), ..*now };
     if !machine.mark(counted) {
         machine.passed_over(slot, &"its start cannot be counted");
@@ -108,14 +109,14 @@ fn on_trial(
     }
 }
 
-/// Checks a slot that is known to be good.
+/// Checks the good slot for damage only.
 fn damage(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, BadImage> {
     let header = header(flash, slot, board)?;
     Check::damage(header).whole(flash)?;
     Ok(header)
 }
 
-/// Checks a slot of which nothing is known.
+/// Checks damage, hash and signature of a slot that is not known to be good.
 fn origin(
     flash: &impl SlotFlash,
     slot: Slot,
@@ -123,7 +124,7 @@ fn origin(
     key: &PublicKey,
 ) -> Result<Header, BadImage> {
     let header = header(flash, slot, board)?;
-    // Before the hash of the image, which takes longer.
+    // The signature is checked before the hash of the image, which takes longer.
     header.verify(key).map_err(|_| BadImage::Foreign)?;
     Check::contents(header).whole(flash)?;
     Ok(header)

@@ -1,4 +1,4 @@
-//! Checks what a slot holds, in pieces.
+//! Checks the contents of a slot, in steps.
 
 use core::fmt;
 
@@ -28,11 +28,11 @@ pub enum BadImage {
     },
     /// A word cannot be read.
     Torn(FlashWord),
-    /// A bit has changed since it was written.
+    /// The CRC does not match: the image has changed since it was written.
     Crc,
     /// The image is not the one that was signed.
     Hash,
-    /// It was signed with another key.
+    /// The header was signed with another key.
     Foreign,
 }
 
@@ -60,7 +60,7 @@ impl core::error::Error for BadImage {}
 /// A check of an image, in steps.
 pub struct Check {
     header: Header,
-    /// Words that were read.
+    /// Number of words checked so far.
     done: u32,
     crc: Digest<'static, u32>,
     hash: Option<Sha512>,
@@ -75,10 +75,10 @@ impl fmt::Debug for Check {
     }
 }
 
-/// The header in the beginning of a slot, for this slot and board.
+/// Reads the header at the beginning of a slot and checks that it is for this slot and board.
 ///
 /// # Errors
-/// There is none, or it is for another slot or board.
+/// There is no header, or it is for another slot or board.
 pub fn header(flash: &impl SlotFlash, slot: Slot, board: &BoardName) -> Result<Header, BadImage> {
     let mut bytes = [0; HEADER];
     for (part, word) in bytes.as_chunks_mut::<WORD>().0.iter_mut().zip(0..) {
@@ -110,17 +110,17 @@ pub(crate) fn fits(
 }
 
 impl Check {
-    /// Looks for damage: each word can be read, and the CRC is right.
+    /// A check for damage: each word must be readable, and the CRC must match.
     pub fn damage(header: Header) -> Self {
         Self { header, done: 0, crc: CRC.digest(), hash: None }
     }
 
-    /// Also compares the image with the signed hash.
+    /// A check for damage that also compares the image with the signed hash.
     pub fn contents(header: Header) -> Self {
         Self { hash: Some(Sha512::new()), ..Self::damage(header) }
     }
 
-    /// Checks up to `words` more words; `None` if some are left.
+    /// Checks up to `words` more words; returns `None` if words are left to check.
     pub fn step(&mut self, flash: &impl SlotFlash, words: u16) -> Option<Result<(), BadImage>> {
         for _ in 0..words {
             let read = self.done.saturating_mul(WORD as u32);
@@ -128,7 +128,7 @@ impl Check {
             if left == 0 {
                 break;
             }
-            // The header was for this slot, so it ends before the slot does.
+            // Not reached: `header` has checked that the image ends within the slot.
             let Some(at) = place(flash, FIRST_WORD.saturating_add(self.done)) else {
                 return Some(Err(BadImage::Crc));
             };

@@ -1,6 +1,7 @@
 //! The update file: one firmware, linked for each slot (docs/update.md section 3).
 //!
-//! 16 bytes, then for each link its header and its image, filled up with 0xFF to whole words of 32 bytes.
+//! It begins with a head of 16 bytes. Then follow, for each link, its header and its image, padded with 0xFF to whole
+//! words of 32 bytes.
 
 use core::fmt;
 
@@ -17,7 +18,7 @@ const MAGIC: [u8; 4] = *b"RGUP";
 const VERSION: u32 = 1;
 const LINKS: usize = Slot::ALL.len();
 
-/// An update, in the bytes of its file.
+/// An update file, borrowed from its bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct UpdateFile<'b> {
     links: [Option<SlotImage<'b>>; LINKS],
@@ -118,8 +119,8 @@ pub fn link_padding(length: usize) -> usize {
 }
 
 impl<'b> UpdateFile<'b> {
-    /// Reads a file. Its form is checked, and that the links are of one firmware; not their contents
-    /// ([`SlotImage::check`]) nor their signatures ([`Header::verify`]).
+    /// Parses a file. Checks its form and that the links are of one firmware. Does not check their contents
+    /// ([`SlotImage::check`]) or signatures ([`Header::verify`]).
     pub fn parse(bytes: &'b [u8]) -> Result<Self, FileError> {
         let (head, mut rest) = bytes.split_first_chunk::<FILE_HEAD>().ok_or(FileError::NotAnUpdate)?;
         let &[magic, version, links, said] = head.as_chunks::<4>().0 else {
@@ -182,7 +183,7 @@ impl<'b> UpdateFile<'b> {
 }
 
 impl SlotImage<'_> {
-    /// Compares the image with CRC and hash of the header.
+    /// Checks the image against CRC and hash of the header.
     pub fn check(&self) -> Result<(), BadImage> {
         if CRC.checksum(self.image) != self.header.crc() {
             return Err(BadImage::Crc);

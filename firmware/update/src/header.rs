@@ -1,7 +1,7 @@
 //! The header of a slot (docs/update.md section 3).
 //!
-//! It is 192 bytes, six words of flash: the signature, then 128 signed bytes, which hold the hash of the image. So
-//! the signature is checked over 128 bytes, and the hash in as many pieces as other tasks need.
+//! It has 192 bytes, six words of flash: the signature, then 128 signed bytes, which contain the hash of the image. So
+//! the signature is checked over 128 bytes only, and the hash can be computed in pieces, between which other tasks run.
 
 use core::fmt;
 
@@ -19,7 +19,7 @@ pub const IMAGE_OFFSET: u32 = 1024;
 const SIGNATURE: usize = HEADER - SIGNED;
 const MAGIC: [u8; 4] = *b"RGFW";
 const VERSION: u32 = 1;
-/// Bytes before the CRC of the header: the signed ones without it.
+/// Number of bytes that the CRC of the header covers: the signed bytes except the CRC itself.
 const CHECKED: usize = SIGNED - 4;
 
 /// The name of a board, such as `nucleo-h743zi`.
@@ -147,7 +147,7 @@ pub struct Header {
     signature: [u8; SIGNATURE],
 }
 
-/// Why bytes are not a header.
+/// Why bytes are not a valid header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum HeaderError {
@@ -319,12 +319,13 @@ impl Header {
         bytes
     }
 
-    /// Checks the signature. Blocks for some million instructions, so a board does it when no cell depends on it.
+    /// Checks the signature. Blocks for some million instructions, so a board calls it only when no cell depends on the
+    /// board.
     pub fn verify(&self, key: &PublicKey) -> Result<(), Foreign> {
         key.0.verify(&self.signed(), &Signature::from(&self.signature)).map_err(|_| Foreign)
     }
 
-    /// Facts about the image except length and hash.
+    /// Facts about the image that the image does not contain.
     pub fn parts(&self) -> &ImageFacts {
         &self.parts
     }
@@ -363,7 +364,7 @@ impl HeaderReader<'_> {
                 self.0 = rest;
                 *field
             }
-            // The fields are as long as the header.
+            // Not reached: the fields together are as long as the header.
             None => [0; N],
         }
     }
@@ -373,7 +374,7 @@ impl HeaderReader<'_> {
     }
 }
 
-/// With a table: a loader checks an image at each start.
+/// Computed with a table, because a loader checks an image at each start.
 pub(crate) static CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 #[cfg(test)]

@@ -13,7 +13,7 @@ pub struct Layout {
     pub slots: [u32; 2],
     /// Number of sectors of a slot, which lie one behind the other.
     pub slot_sectors: u8,
-    /// Where RAM begins and ends: a vector table begins with the address of a stack.
+    /// Begin and end of each RAM: a vector table begins with the initial stack pointer, which must point into RAM.
     pub ram: &'static [(u32, u32)],
 }
 
@@ -21,8 +21,8 @@ pub struct Layout {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stores(pub [[u32; 2]; 2]);
 
-/// ST's NUCLEO-H743ZI2. Sectors 0 to 7 are the first bank, 8 to 15 the second. The loader is in sector 0, the image of
-/// a probe in sector 14.
+/// ST's NUCLEO-H743ZI2. Sectors 0 to 7 are the first bank, 8 to 15 the second. The loader is in sector 0; the
+/// configuration image that a debug probe writes is in sector 14.
 pub const NUCLEO_H743ZI: Layout = Layout {
     board: "nucleo-h743zi",
     sector: 0x2_0000,
@@ -31,12 +31,12 @@ pub const NUCLEO_H743ZI: Layout = Layout {
     ram: &[(0x2000_0000, 0x2002_0000), (0x2400_0000, 0x2408_0000)],
 };
 
-/// Its stores. A firmware keeps its own in the bank that it does not run from.
+/// The stores of the NUCLEO-H743ZI2. A firmware uses the store in the bank that it does not run from.
 pub const NUCLEO_H743ZI_STORES: Stores = Stores([[0x081A_0000, 0x081E_0000], [0x080C_0000, 0x080E_0000]]);
 
-/// QEMU's `mps2-an500`. A file of the host stands for the flash, in which slot B lies behind slot A; the loader copies
-/// the slot that it runs to these addresses, in 4 MiB of RAM for programs, of which the first is the loader's. The
-/// store has one place, in a file too: there are no banks that stand still.
+/// QEMU's `mps2-an500`. A file on the host stands for the flash; in it slot B is behind slot A. The loader copies the
+/// slot that it runs to these addresses, in 4 MiB of program RAM, the first of which is the loader's. The store is a
+/// file too. It has only one place, because there are no flash banks that stall during an erase.
 pub const MPS2_AN500: Layout = Layout {
     board: "mps2-an500",
     sector: 0x2_0000,
@@ -68,7 +68,7 @@ impl Layout {
         (self.slot_sectors as u32).saturating_mul(self.sector)
     }
 
-    /// Where a slot begins in memory that holds all of them one behind the other.
+    /// Offset of a slot in memory that contains all slots one behind the other.
     pub const fn slot_offset(&self, slot: Slot) -> u32 {
         match slot {
             Slot::A => 0,

@@ -13,11 +13,11 @@
 //! A board's firmware in two slots (docs/update.md).
 //!
 //! In: the flash of the slots, marks of the store, bytes of an update. Out: what is to be written and erased, which
-//! slot a loader runs, and why an update is refused. Knows neither a chip nor a network.
+//! slot a loader runs, and why an update is refused. Does not know a chip or a network.
 //!
-//! A slot begins with a [`Header`], which is signed and holds the hash of the image behind it. [`Receive`] writes an
-//! update into the slot that does not run. [`choose`] is the loader: the slot on trial while it has starts left, or
-//! else the good one. [`UpdateFile`] is what a host sends: the same firmware linked for each slot.
+//! A slot begins with a [`Header`], which is signed and contains the hash of the image behind it. [`Receive`] writes an
+//! update into the slot that does not run. The loader calls [`choose`], which returns the slot on trial while it has
+//! starts left, otherwise the good one. [`UpdateFile`] is what a host sends: the same firmware linked for each slot.
 //!
 //! ```
 //! use recipe_update::{BoardName, Formats, Header, ImageFacts, PublicKey, Slot, Version};
@@ -61,8 +61,8 @@ use recipe_store::{Flash, FlashWord, Word};
 
 /// The flash of a slot.
 pub trait SlotFlash: Flash {
-    /// The bytes of a word; `None` if it cannot be read. [`Flash::read`] gives zeros, which may also be in an image:
-    /// running such a word would be a fault.
+    /// The bytes of a word; `None` if it cannot be read. [`Flash::read`] returns zeros instead, which cannot be told
+    /// from zeros in an image; but executing an unreadable word causes a fault.
     fn whole(&self, place: FlashWord) -> Option<Word>;
 }
 
@@ -77,7 +77,7 @@ fn size(flash: &impl Flash) -> u32 {
     words.saturating_mul(recipe_store::WORD as u32)
 }
 
-/// The place of a word counted from the beginning of the slot; `None` behind its end.
+/// Sector and word of the word with this index in the slot; `None` beyond the end of the slot.
 fn place(flash: &impl Flash, word: u32) -> Option<FlashWord> {
     let words = u32::from(flash.geometry().words);
     let sector = u8::try_from(word.checked_div(words)?).ok()?;

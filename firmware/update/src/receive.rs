@@ -1,8 +1,8 @@
 //! Writes an update into the free slot.
 //!
-//! The header is checked before anything is erased. The image is written word by word and each word is read back;
-//! then its hash is compared; then the header is written, the word with the magic number last. So a slot with a
-//! header is whole, and what was cut short has none.
+//! The header is checked before anything is erased. The image is written word by word, and each word is read back.
+//! Then the hash of the image is compared with the signed one. The header is written last, and of it the word with the
+//! magic number. So a slot with a header is complete, and an interrupted update leaves a slot without one.
 
 use core::fmt;
 
@@ -37,9 +37,9 @@ pub enum ReceiveStep {
         /// Number of bytes received so far.
         offset: u32,
     },
-    /// Call again; a chance to let other tasks run.
+    /// Nothing to do: call again. Other tasks can run in between.
     Again,
-    /// The end: the slot holds the update, or nothing that can run.
+    /// The end: the slot contains the update, or after an error nothing that can run.
     End(Result<(), ReceiveError>),
 }
 
@@ -47,7 +47,7 @@ pub enum ReceiveStep {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ReceiveError {
-    /// A word reads differently than it was written.
+    /// A word reads differently from what was written.
     Worn(FlashWord),
     /// The received image is not the signed one.
     Bad(BadImage),
@@ -66,7 +66,7 @@ impl fmt::Display for ReceiveError {
 
 impl core::error::Error for ReceiveError {}
 
-/// The bytes are not the next ones.
+/// The bytes that were passed do not continue those received so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Gap {
     /// Offset of the next bytes.
@@ -84,7 +84,7 @@ impl core::error::Error for Gap {}
 #[derive(Debug)]
 #[allow(clippy::large_enum_variant, reason = "there is no heap")]
 enum ReceivePhase {
-    /// From this sector on: the first one has the header.
+    /// Erase from this sector on. The first sector, with the header, comes first.
     Erase {
         sector: u8,
         end: u8,
@@ -104,12 +104,12 @@ enum ReceivePhase {
 }
 
 impl Receive {
-    /// Begins if the update may be installed. `flash` is the free slot.
+    /// Begins to receive an update if it may be installed. `flash` is the free slot.
     ///
     /// The signature is checked elsewhere: by [`Header::verify`], when no cell depends on the board, and by the loader.
     ///
     /// # Errors
-    /// Why it may not be installed; nothing has changed.
+    /// The update may not be installed; nothing has changed.
     pub fn begin(
         header: Header,
         running: &RunningFirmware,
@@ -134,11 +134,11 @@ impl Receive {
         self.taken
     }
 
-    /// Accepts bytes of the image, at most up to the next word, and returns how many. [`Receive::next`] must be
-    /// followed before more are accepted.
+    /// Accepts bytes of the image, at most up to the end of the current word, and returns how many. The steps of
+    /// [`Receive::next`] must be executed before more bytes are accepted.
     ///
     /// # Errors
-    /// They are not the next ones. None were accepted.
+    /// `offset` is not that of the next byte. No bytes were accepted.
     pub fn take(&mut self, offset: u32, bytes: &[u8]) -> Result<usize, Gap> {
         if offset != self.taken {
             return Err(Gap { expected: self.taken });
@@ -163,7 +163,7 @@ impl Receive {
         self.collected == WORD || self.collected > 0 && self.taken == self.header.length()
     }
 
-    /// Returns the next step; called again when that is done, until [`ReceiveStep::End`].
+    /// Returns the next step. Call it again when that step is done, until it returns [`ReceiveStep::End`].
     pub fn next(&mut self, flash: &impl SlotFlash) -> ReceiveStep {
         loop {
             match &mut self.phase {
@@ -180,7 +180,7 @@ impl Receive {
                         return ReceiveStep::Take { offset: self.taken };
                     }
                     let word = self.taken.saturating_sub(1).checked_div(WORD as u32).unwrap_or(0);
-                    // The image was checked to fit into the slot.
+                    // Not reached: `begin` has checked that the image fits into the slot.
                     let Some(at) = place(flash, FIRST_WORD.saturating_add(word)) else {
                         self.phase = ReceivePhase::End(Err(ReceiveError::Bad(BadImage::Crc)));
                         continue;
@@ -227,7 +227,7 @@ impl Receive {
         }
     }
 
-    /// The nth word of the header that is written; `None` behind the last.
+    /// The word of the header that is written as the `nth`, and its place; `None` after the last.
     fn header_word(&self, nth: usize) -> Option<(FlashWord, Word)> {
         let word = *ORDER.get(nth)?;
         let bytes = self.header.encode();
@@ -236,7 +236,7 @@ impl Receive {
     }
 }
 
-/// Behind the end of an image.
+/// Padding behind the end of an image.
 const FILL: Word = [0xFF; WORD];
 /// Words of the header as they are written: the one with the magic number last.
 const ORDER: [u16; HEADER / WORD] = [0, 1, 3, 4, 5, 2];

@@ -17,8 +17,8 @@ pub struct RunningFirmware {
     pub slot: Slot,
     /// Version of the running firmware.
     pub version: Version,
-    /// The oldest and the newest version of the images in the store that may have to run after the update: the live
-    /// one, the one before it, and the one on trial. `None` if there is none.
+    /// The oldest and the newest version of the configuration images that may have to run after the update: the live
+    /// one, the previous one, and the one on trial. `None` if there is none.
     pub kept: Option<(u32, u32)>,
 }
 
@@ -27,7 +27,7 @@ pub struct RunningFirmware {
 pub enum Downgrade {
     /// Refuse it.
     Refused,
-    /// Accept it: requested explicitly.
+    /// Accept it, because it was requested explicitly.
     Allowed,
 }
 
@@ -109,7 +109,7 @@ impl RunningFirmware {
         if offered < running && downgrade == Downgrade::Refused {
             return Err(UpdateRefused::Older { offered, running });
         }
-        // Even for a requested downgrade: without a configuration the buses would be silent.
+        // Also checked for a requested downgrade: without a configuration the buses would be silent.
         let reads = header.parts().formats;
         if let Some((oldest, newest)) = self.kept {
             for kept in [oldest, newest] {
