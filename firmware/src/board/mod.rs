@@ -1,7 +1,7 @@
-//! The boards. Only they know pins, clocks and interrupts.
+//! The boards. Only code in here knows pins, clocks and interrupts.
 //!
-//! A board's module has a type that implements [`firmware::platform::Board`], here `Board`, and `run`, which creates it and
-//! runs the tasks that are started with it.
+//! A board's module has a type that implements [`firmware::platform::Board`], here `Board`, and `run`, which creates it
+//! and runs the tasks that are started with it.
 
 mod slot;
 mod stack;

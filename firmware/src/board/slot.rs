@@ -3,7 +3,7 @@
 use recipe_update::Slot;
 
 unsafe extern "C" {
-    /// Its address is the number of the slot: 1 for A, 2 for B.
+    /// The address of this symbol is the number of the slot: 1 for A, 2 for B.
     static _slot: u8;
 }
 

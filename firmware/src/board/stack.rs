@@ -3,7 +3,7 @@
 use cortex_m::peripheral::MPU;
 
 unsafe extern "C" {
-    /// The lowest address of the guard, whose size is a power of two and which is aligned to it.
+    /// The lowest address of the guard. The size of the guard is a power of two, and the guard is aligned to its size.
     static _stack_guard: u32;
     /// The stack's lowest address, where the guard ends.
     static _stack_end: u32;
@@ -16,12 +16,12 @@ fn bottom() -> usize {
     &raw const _stack_end as usize
 }
 
-/// Makes the memory below the stack inaccessible, so that an overflow faults. The fault's handler can access
-/// it, because it needs a stack.
+/// Makes the guard below the stack inaccessible, so that a stack overflow causes a fault. The MPU does not apply to the
+/// fault's handler, which needs a stack itself.
 pub(super) fn guard() {
     let start = &raw const _stack_guard as u32;
     let bits = (bottom() as u32 - start).trailing_zeros();
-    // SAFETY: nothing else uses the MPU, and the linker script places nothing in the guard.
+    // SAFETY: nothing else uses the MPU. The region covers only the guard, in which the linker script places nothing.
     unsafe {
         let mpu = &*MPU::PTR;
         mpu.rnr.write(0);
@@ -39,7 +39,8 @@ pub(super) fn guard() {
 pub(super) fn paint() {
     let used = cortex_m::register::msp::read() as usize - 256;
     for address in (bottom()..used).step_by(4) {
-        // SAFETY: the memory between the guard and the present stack frames is unused.
+        // SAFETY: the address is between the guard and the current stack frames, with a margin of 256 bytes. Nothing
+        // uses this memory now, and the linker script places nothing else there.
         unsafe { core::ptr::with_exposed_provenance_mut::<u32>(address).write_volatile(PAINT) }
     }
 }
@@ -47,7 +48,7 @@ pub(super) fn paint() {
 /// Highest stack use so far, in bytes.
 pub(crate) fn used() -> usize {
     let top = &raw const _stack_start as usize;
-    // SAFETY: the stack is readable as a whole.
+    // SAFETY: the address is aligned and between the guard and the top of the stack, all of which is readable RAM.
     let is_painted = |&address: &usize| unsafe {
         core::ptr::with_exposed_provenance::<u32>(address).read_volatile() == PAINT
     };

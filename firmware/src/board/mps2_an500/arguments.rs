@@ -1,6 +1,6 @@
 //! The semihosting arguments (`-semihosting-config ...,arg=firmware,arg=PATH`).
 //!
-//! The loader has this file too (firmware/boot/src/board/mps2_an500/mod.rs).
+//! The loader compiles this file too (firmware/boot/src/board/mps2_an500/mod.rs).
 
 use core::ffi::CStr;
 

@@ -1,4 +1,5 @@
-//! The button, which QEMU does not have: it is pressed while the file of the fifth semihosting argument exists.
+//! The button. QEMU has none, so a file stands for it: the button is pressed while the file that the fifth semihosting
+//! argument names exists.
 
 use firmware::platform;
 use semihosting::fs::File;
@@ -6,7 +7,7 @@ use semihosting::fs::File;
 use super::arguments::FileName;
 
 pub(crate) struct UserButton {
-    /// `None` if no file is named: no button.
+    /// Name of the file; `None` if none was given, then there is no button.
     name: Option<FileName>,
 }
 

@@ -1,7 +1,7 @@
-//! The console: UART 3, without interrupts. What cannot be sent at once is dropped, because the log must not delay
+//! The console: UART 3, without interrupts. Text that cannot be sent at once is dropped, because the log must not delay
 //! the buses.
 //!
-//! The loader has this file too (firmware/boot/src/board/mps2_an500/mod.rs).
+//! The loader compiles this file too (firmware/boot/src/board/mps2_an500/mod.rs).
 
 use core::fmt::{self, Write};
 

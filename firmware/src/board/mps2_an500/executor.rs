@@ -1,4 +1,4 @@
-//! An executor that sleeps with WFI. QEMU ignores WFE, so Embassy's own would keep a core of the host busy.
+//! An executor that sleeps with WFI. QEMU ignores WFE, so Embassy's own executor would keep a core of the host busy.
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
@@ -19,15 +19,15 @@ pub(super) fn run(init: impl FnOnce(Spawner)) -> ! {
     init(executor.spawner());
     loop {
         while PENDING.swap(false, Ordering::AcqRel) {
-            // SAFETY: polled only here, and not from a task.
+            // SAFETY: this loop is the only caller of `poll`, and it is not run by a task, so `poll` is not reentered.
             unsafe { executor.poll() };
         }
-        // With interrupts disabled, one after this check stays pending and ends WFI at once.
+        // Interrupts are disabled for the check: an interrupt after it stays pending and ends WFI at once.
         cortex_m::interrupt::disable();
         if !PENDING.load(Ordering::Acquire) {
             cortex_m::asm::wfi();
         }
-        // SAFETY: not within a critical section.
+        // SAFETY: this function does not run within a critical section, so enabling interrupts breaks none.
         unsafe { cortex_m::interrupt::enable() };
     }
 }

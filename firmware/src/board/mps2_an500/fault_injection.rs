@@ -13,7 +13,7 @@ use crate::board::Tasks;
 
 #[derive(Debug, Clone, Copy)]
 enum InjectedFault {
-    /// Waits forever without answering the watchdog's checks.
+    /// Waits forever without answering the checks of the task watch.
     Stall,
     /// Never yields.
     Spin,
@@ -51,7 +51,7 @@ async fn make(pulse: &'static Pulse, fault: InjectedFault) -> ! {
             InjectedFault::Overflow => panic!("{} levels deep and still there", overflow(0)),
             InjectedFault::Fault => {
                 let nowhere = core::ptr::with_exposed_provenance::<u32>(NOWHERE);
-                // SAFETY: there is no memory at this address: the read faults, as intended.
+                // SAFETY: there is no memory at this address, so nothing is aliased; the read faults, as intended.
                 let value = unsafe { nowhere.read_volatile() };
                 panic!("{value} where nothing is")
             }

@@ -1,5 +1,5 @@
-//! The flash of the store, a file of the host that the fourth semihosting argument names, and that of the slots, which
-//! the sixth one names. Without the fourth there is no store.
+//! The flash of store and slots: two files on the host. The fourth semihosting argument names the file of the store,
+//! the sixth that of the slots. Without the fourth argument there is no store.
 
 use firmware::stored::StoreFlash;
 use firmware::update::{Site, Slots};
@@ -42,9 +42,10 @@ fn opened() -> Result<Slots<HostFlash>, &'static str> {
     Ok(Slots { running, key, own: open(running)?, free: open(running.other())? })
 }
 
-/// The public key of the loader, behind a mark (firmware/boot/loader.x).
+/// The public key in the loader, preceded by a mark (firmware/boot/loader.x).
 fn key() -> Option<[u8; 32]> {
-    // SAFETY: memory for programs, which nobody writes; the program itself is elsewhere.
+    // SAFETY: this address is in program RAM, which can be read as a whole. It belongs to the loader, which has ended:
+    // nothing writes to it, and this program has no objects there.
     let marked = unsafe { core::ptr::with_exposed_provenance::<[u8; 36]>(KEY).read_volatile() };
     marked.strip_prefix(b"RGUK")?.first_chunk().copied()
 }
@@ -81,9 +82,9 @@ impl StoreFlash for StoreFile {
     }
 }
 
-/// The arguments with the names of the files. The loader has them too.
+/// Indices of the semihosting arguments with the names of the files. The loader uses the same indices.
 const STORE: usize = 3;
 const SLOTS: usize = 5;
 const STORE_SECTORS: u8 = 2;
-/// Where the loader has its key.
+/// Address of the mark and the key in the loader.
 const KEY: usize = 0x400;

@@ -1,6 +1,6 @@
 //! Flash in a file of the host, with the NUCLEO's sectors and words. Words are never torn.
 //!
-//! The loader has this file too (firmware/boot/src/board/mps2_an500/mod.rs).
+//! The loader compiles this file too (firmware/boot/src/board/mps2_an500/mod.rs).
 
 use core::cell::RefCell;
 use core::fmt;
@@ -48,7 +48,7 @@ impl HostFlash {
         self.start + (u64::from(sector) * u64::from(WORDS) + u64::from(word)) * WORD as u64
     }
 
-    /// Whether all bytes are in the file.
+    /// Writes bytes to the file; returns whether all of them were written.
     fn write_at(&mut self, offset: u64, mut bytes: &[u8]) -> bool {
         *self.page.get_mut() = None;
         let file = self.file.get_mut();
@@ -64,7 +64,7 @@ impl HostFlash {
         true
     }
 
-    /// Bytes beyond the end of the file read as blank.
+    /// Reads a page. Bytes beyond the end of the file read as blank.
     fn read_page(&self, offset: u64) -> [u8; PAGE * WORD] {
         let mut bytes = [0xFF; PAGE * WORD];
         let mut file = self.file.borrow_mut();

@@ -1,5 +1,5 @@
 //! QEMU's `mps2-an500`: a Cortex-M7 with five UARTs and a LAN9118. RS-485 on UART 0 and 1, CAN as slcan
-//! on UART 2, the log on UART 3; configuration, store and slots are files of the host, named by semihosting.
+//! on UART 2, the log on UART 3; configuration, store and slots are files on the host, named by semihosting arguments.
 //!
 //! It exists so that the firmware runs end to end in CI.
 
@@ -72,7 +72,7 @@ impl platform::Board for Mps2An500 {
         flash::slots()
     }
 
-    /// The file's operations end at once.
+    /// The operations of a file on the host complete at once, so no time limit or feeding is needed.
     fn block_on<T>(&mut self, operation: impl Future<Output = T>) -> T {
         embassy_futures::block_on(operation)
     }
@@ -147,8 +147,8 @@ pub(crate) fn run<const N: usize>(start: impl FnOnce(Spawner, Mps2An500) -> Task
     })
 }
 
-/// Ends QEMU with this exit code. With a loader it is a board that restarts: which firmware runs then is the loader's
-/// decision.
+/// Ends QEMU with this exit code. With a loader, restarts the board instead, so that the loader decides which firmware
+/// runs next.
 fn end(code: i32) -> ! {
     match super::slot::running() {
         None => semihosting::process::exit(code),
@@ -191,8 +191,8 @@ impl Lan9118Registers for LanRegisters {
         registers::write(registers::LAN9118 + u32::from(offset), value);
     }
 
-    /// QEMU does not poll the host's sockets when the guest sends, but when a timer expires. Without this a connection
-    /// to the host takes a second.
+    /// QEMU polls the host's sockets when a timer expires, but not when the guest sends. Without this timer a
+    /// connection to the host takes a second.
     fn transmitted(&self) {
         time::wake_emulator();
     }
@@ -204,7 +204,7 @@ fn on_lan9118() {
     Lan9118::interrupt(&LanRegisters, &LAN_WAKER);
 }
 
-/// An interrupt by its number.
+/// The number of an interrupt.
 #[derive(Debug, Clone, Copy)]
 struct Irq(u16);
 
@@ -213,12 +213,14 @@ impl Irq {
     const LAN9118: Self = Self(13);
 
     fn enable(self) {
-        // SAFETY: its handler is in the vector table; critical sections are not affected.
+        // SAFETY: the vector table below has a handler for it. Critical sections disable all interrupts with PRIMASK,
+        // so unmasking one in the NVIC does not break them.
         unsafe { NVIC::unmask(self) }
     }
 }
 
-// SAFETY: the numbers above and the UARTs' are those of the vector table.
+// SAFETY: the numbers of TIMER0, LAN9118 and the UARTs are valid indices of the vector table below, which has their
+// handlers at these positions. An `Irq` does not change its number.
 unsafe impl InterruptNumber for Irq {
     fn number(self) -> u16 {
         self.0

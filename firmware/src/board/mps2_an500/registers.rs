@@ -1,6 +1,6 @@
 //! Addresses of the devices, and access to their registers.
 //!
-//! The loader has this file too (firmware/boot/src/board/mps2_an500/mod.rs).
+//! The loader compiles this file too (firmware/boot/src/board/mps2_an500/mod.rs).
 
 pub(crate) const UARTS: [u32; 5] = [0x4000_4000, 0x4000_5000, 0x4000_6000, 0x4000_7000, 0x4000_9000];
 /// The timer of the alarm.
@@ -13,11 +13,13 @@ pub(crate) const FPGAIO: u32 = 0x4002_8000;
 pub(crate) const LAN9118: u32 = 0xA000_0000;
 
 pub(crate) fn read(address: u32) -> u32 {
-    // SAFETY: callers pass registers of the devices above; reading them has no effect on memory.
+    // SAFETY: all callers pass addresses of aligned 32-bit registers of the devices above. Reading them does not
+    // change memory.
     unsafe { core::ptr::with_exposed_provenance::<u32>(address as usize).read_volatile() }
 }
 
 pub(crate) fn write(address: u32, value: u32) {
-    // SAFETY: callers pass registers of the devices above, none of which writes to memory.
+    // SAFETY: all callers pass addresses of aligned 32-bit registers of the devices above, none of which writes to
+    // memory.
     unsafe { core::ptr::with_exposed_provenance_mut::<u32>(address as usize).write_volatile(value) }
 }

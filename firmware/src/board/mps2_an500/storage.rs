@@ -26,7 +26,7 @@ impl fmt::Display for StorageError {
             Self::NoName => f.write_str("no configuration: give its path as the second semihosting argument"),
             Self::Unreadable => {
                 f.write_str("cannot read the configuration file")?;
-                // The user knows the name of the file.
+                // Include the name of the file, which tells the user what to look for.
                 argument(1, |path| write!(f, " {path}")).unwrap_or(Ok(()))
             }
         }

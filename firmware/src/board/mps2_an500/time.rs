@@ -20,7 +20,8 @@ const RELOAD: u32 = TIMER0 + 0x8;
 const INTCLEAR: u32 = TIMER0 + 0xC;
 const CTRL_ALARM: u32 = 0b1001;
 const CYCLES_PER_MICRO: u64 = 25;
-/// Longest alarm: a later one is set in steps. It also ensures that no overflow of the counter is missed.
+/// Longest alarm, in microseconds; a later one is set in steps. The limit also ensures that no overflow of the counter
+/// is missed.
 const LONGEST: u64 = 60_000_000;
 
 struct TimerDriver {
@@ -29,7 +30,7 @@ struct TimerDriver {
 
 struct TimerState {
     queue: Queue,
-    /// The last value of the counter, and its number of overflows.
+    /// The last value read from the counter, and the number of its overflows.
     last: u32,
     rounds: u32,
 }
@@ -57,8 +58,8 @@ impl TimerState {
         u64::from(self.rounds) << 32 | u64::from(counter)
     }
 
-    /// Wakes expired timers and sets the alarm for the next: one access, since each costs the emulator some
-    /// microseconds.
+    /// Wakes expired timers and sets the alarm for the next one. It does so with one register access, because each
+    /// access costs the emulator some microseconds.
     fn rearm(&mut self) {
         let now = self.now();
         let next = self.queue.next_expiration(now);

@@ -15,22 +15,25 @@ pub(crate) struct CanRegisters;
 
 impl McanBlock for CanRegisters {
     fn read(&self, offset: u8) -> u32 {
-        // SAFETY: the driver's offsets are registers of the controller, aligned.
+        // SAFETY: the driver passes only offsets of M_CAN registers, which are multiples of 4 and within FDCAN1.
         unsafe { FDCAN1.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().read_volatile() }
     }
 
     fn write(&self, offset: u8, value: u32) {
-        // SAFETY: a register at an aligned offset; the controller accesses no memory but its message RAM.
+        // SAFETY: the driver passes only offsets of M_CAN registers, which are multiples of 4 and within FDCAN1. The
+        // controller accesses no memory except its message RAM.
         unsafe { FDCAN1.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().write_volatile(value) }
     }
 
     fn ram_read(&self, word: u16) -> u32 {
-        // SAFETY: the driver's words are within the message RAM, whose size is checked below.
+        // SAFETY: the driver passes words below `MESSAGE_RAM_WORDS`, which the assertion below shows to be within the
+        // message RAM.
         unsafe { FDCANRAM.as_ptr().cast::<u32>().add(usize::from(word)).read_volatile() }
     }
 
     fn ram_write(&self, word: u16, value: u32) {
-        // SAFETY: within the message RAM (checked below), which only the driver and the controller use.
+        // SAFETY: the driver passes words below `MESSAGE_RAM_WORDS`, which the assertion below shows to be within the
+        // message RAM. Only the driver and the controller use it.
         unsafe { FDCANRAM.as_ptr().cast::<u32>().add(usize::from(word)).write_volatile(value) }
     }
 }
@@ -50,11 +53,12 @@ impl Handler<typelevel::FDCAN1_IT0> for CanInterrupt {
 }
 
 /// Bypasses the clock calibration unit between the kernel clock and the controllers. After a reset its output is
-/// no valid clock (RM0433, "Clock calibration on CAN"). It is writable in the state that [`Mcan::start`] leaves.
+/// not a valid clock (RM0433, "Clock calibration on CAN"). Its register can be written in the configuration mode in
+/// which [`Mcan::start`] leaves the controller.
 fn bypass_calibration() {
     const CCFG: usize = 0x804;
     const BYPASS: u32 = 1 << 6;
-    // SAFETY: an aligned register of FDCAN, which nothing else uses.
+    // SAFETY: CCFG is an aligned 32-bit register within the block of FDCAN, and nothing else uses it.
     unsafe {
         let register = FDCAN1.as_ptr().cast::<u8>().add(CCFG).cast::<u32>();
         register.write_volatile(register.read_volatile() | BYPASS);
@@ -74,7 +78,8 @@ pub(super) fn start(pins: CanPins, bitrate: u32) -> Result<CanDevice, McanError>
     let clock = rcc::frequency::<peripherals::FDCAN1>().0;
     let started = Mcan::start(CanRegisters, 0, &WAKER, bitrate, clock)?;
     bypass_calibration();
-    // SAFETY: its handler is bound; critical sections are not affected.
+    // SAFETY: `CanInterrupt` is bound as its handler. Critical sections disable all interrupts with PRIMASK, so
+    // unmasking one in the NVIC does not break them.
     unsafe { typelevel::FDCAN1_IT0::enable() };
     Ok(started)
 }

@@ -17,11 +17,11 @@ pub(super) enum ClockSource {
     Internal,
 }
 
-/// Checks for the external clock, for which the initialisation would wait forever.
+/// Returns the external clock if it runs. The check is needed because the initialisation would wait for it forever.
 pub(super) fn source() -> ClockSource {
     RCC.cr().modify(|w| w.set_hsebyp(true));
     RCC.cr().modify(|w| w.set_hseon(true));
-    // It is ready after a few of its cycles; this waits for some milliseconds.
+    // The external clock is ready after a few of its cycles; this loop takes some milliseconds.
     for _ in 0..50_000 {
         if RCC.cr().read().hserdy() {
             return ClockSource::External;
@@ -68,12 +68,12 @@ pub(super) fn config(source: ClockSource) -> Config {
 }
 
 /// Limits AXI SRAM to one read at a time on chips of revision Y (errata ES0392, "reading from AXI SRAM may lead to
-/// data read corruption"). Comes before all DMA.
+/// data read corruption"). Must be called before any DMA starts.
 pub(super) fn errata() {
     const AXI_TARG7_FN_MOD: usize = 0x5100_8108;
     const REVISION_Y: u16 = 0x1003;
     if DBGMCU.idc().read().rev_id() <= REVISION_Y {
-        // SAFETY: a register of the AXI interconnect, which nothing else uses.
+        // SAFETY: the address of an aligned 32-bit register of the AXI interconnect, which nothing else uses.
         unsafe { core::ptr::with_exposed_provenance_mut::<u32>(AXI_TARG7_FN_MOD).write_volatile(1) }
     }
 }

@@ -1,5 +1,5 @@
-//! The crash record: a text about a fault or a hang, which the next start logs. It is in RAM, whose contents
-//! survive the watchdog's reset.
+//! The crash record: a text about a fault or a hang. It is in RAM that keeps its contents during a reset by the
+//! watchdog, and the next start logs it.
 
 use core::fmt::{self, Write};
 use core::sync::atomic::{AtomicU8, AtomicU32, Ordering};
@@ -26,17 +26,17 @@ struct Record {
     len: AtomicU32,
     sum: AtomicU32,
     text: [AtomicU8; MAX_TEXT],
-    /// Written last: the RAM's controller holds an incomplete 64-bit word until the next write, and a reset would
-    /// lose it.
+    /// Written last, to flush the word before it: the RAM's controller holds back an incomplete 64-bit word until the
+    /// next write, and a reset would lose it.
     after: AtomicU32,
 }
 
-/// The record, behind a `black_box`: the compiler would assume the zeros above.
+/// The record, passed through `black_box`; otherwise the compiler could assume that it has its initial zeros.
 fn record() -> &'static Record {
     core::hint::black_box(&RECORD)
 }
 
-/// Writes text, truncated at the capacity; holds its length.
+/// Writes text, truncated at the capacity. The number is the length so far.
 struct CrashWriter(usize);
 
 impl Write for CrashWriter {
@@ -63,9 +63,9 @@ impl CrashWriter {
     }
 }
 
-/// Saves a fault. After a stack overflow the frame, and so its address, may be wrong.
+/// Saves a fault. After a stack overflow, the exception frame and the addresses in it may be wrong.
 pub(super) fn save_fault(frame: &ExceptionFrame) {
-    // SAFETY: reads of the core's fault registers, which have no effect.
+    // SAFETY: these are the core's fault registers, which always exist; reading them has no side effects.
     let (cause, memory, bus) = unsafe {
         let scb = &*SCB::PTR;
         (scb.cfsr.read(), scb.mmfar.read(), scb.bfar.read())

@@ -1,7 +1,7 @@
 //! Ethernet: RMII with the board's LAN8742A, 100 Mbit/s full duplex.
 //!
-//! The driver would wait forever for the MAC's reset, which needs the PHY's 50 MHz, and for a missing PHY. Both are
-//! checked with a limit before the driver is started.
+//! The driver would wait forever for the MAC's reset, which needs the PHY's 50 MHz, and for a missing PHY. So both are
+//! checked before the driver is started, with a time limit.
 
 use core::fmt;
 use core::future::Future;
@@ -25,14 +25,14 @@ pub(crate) type Ethernet = eth::Ethernet<'static, peripherals::ETH, Lan8742>;
 /// Why there is no Ethernet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum EthernetError {
-    /// There is no clock from the PHY.
+    /// The PHY provides no clock.
     NoClock,
     /// There is no PHY at the expected address.
     NoPhy {
         /// The identifier that was read.
         found: u16,
     },
-    /// It was started before.
+    /// The controller has already been handed out.
     Taken,
 }
 
@@ -76,7 +76,7 @@ impl EthernetParts {
             return Err(EthernetError::NoClock);
         }
         let mut sma = Sma::new(self.sma, self.mdio, self.mdc);
-        // After power-on it may not answer yet.
+        // After power-on the PHY may not answer yet.
         let until = Instant::now() + TIMEOUT;
         loop {
             match sma.smi_read(PHY_ADDRESS, PHY_ID1) {
@@ -106,12 +106,12 @@ impl EthernetParts {
     }
 }
 
-/// Resets the MAC; returns whether that succeeded, for which it needs the PHY's clock.
+/// Resets the MAC. The reset succeeds only with the PHY's clock, so the result tells whether there is one.
 fn has_clock(ref_clk: Peri<'_, PA1>) -> bool {
     const FUNCTION: u8 = 11;
     let mut pin = Flex::new(ref_clk);
     pin.set_as_af_unchecked(FUNCTION, AfType::output(OutputType::PushPull, Speed::VeryHigh));
-    // Dropping it would disconnect the clock.
+    // Dropping the pin would disconnect the clock.
     core::mem::forget(pin);
     critical_section::with(|_| {
         RCC.ahb1enr().modify(|w| {
@@ -156,7 +156,7 @@ impl Lan8742 {
 }
 
 impl Phy for Lan8742 {
-    /// Only starts the reset, which takes up to half a second; `poll_link` continues after it.
+    /// Only starts the reset, which takes up to half a second. `poll_link` sets up the PHY after it.
     fn phy_reset(&mut self) {
         self.write(PHY_CONTROL, CONTROL_RESET);
         self.next_poll = Instant::now() + LINK_PERIOD;

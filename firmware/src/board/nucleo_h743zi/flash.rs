@@ -1,8 +1,9 @@
-//! The flash of the stores and of the slots. Only the bank that the program does not run from is written, so the
-//! program continues while a sector is erased; a store that another firmware has left in the program's bank is only
-//! read. RM0433, "Embedded Flash memory".
+//! The flash of the stores and of the slots. RM0433, "Embedded Flash memory".
 //!
-//! Not the driver of `embassy-stm32`, which would copy torn flash words: a bus fault.
+//! Only the bank that the program does not run from is written, so the program continues while a sector is erased. A
+//! store that another firmware has left in the program's bank is only read.
+//!
+//! The driver of `embassy-stm32` is not used, because it would copy torn flash words, which causes a bus fault.
 
 use core::future::Future;
 use core::pin::pin;
@@ -25,15 +26,15 @@ const _: () = assert!(FLASH_WORD == WORD);
 
 const FLASH_START: usize = 0x0800_0000;
 const BANK_SIZE: usize = 0x10_0000;
-/// Where the loader has its public key, behind this mark (firmware/boot/loader.x).
+/// Address of the public key in the loader, which is preceded by this mark (firmware/boot/loader.x).
 const KEY: usize = FLASH_START + 0x400;
 const KEY_MARK: [u8; 4] = *b"RGUK";
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 /// Clears all flags of a bank.
 const ALL_FLAGS: Ccr = Ccr(0x0FEF_0000);
-/// 64 bits at a time: the supply is 3.3 V.
+/// Parallelism of programming: 64 bits, which the supply of 3.3 V allows.
 const FASTEST: u8 = 3;
-// Datasheet DS12110, "Flash memory programming": at most 2 s, and 0.4 ms.
+// Datasheet DS12110, "Flash memory programming": an erase takes at most 2 s, a write 0.4 ms.
 const ERASE: Wait = Wait { look: Duration::from_millis(2), limit: Duration::from_secs(4) };
 const WRITE: Wait = Wait { look: Duration::from_micros(100), limit: Duration::from_millis(10) };
 
@@ -56,7 +57,7 @@ const _: () = assert!(BOARD.slot_sectors == 5);
 /// The places for the store.
 ///
 /// # Safety
-/// To be called once.
+/// Must be called at most once: nothing else may write to the flash of an [`Area`].
 pub(super) unsafe fn stores() -> StorePlaces<Area> {
     let place = |side: Side| {
         let [first, second] = STORES.sectors(side);
@@ -65,7 +66,8 @@ pub(super) unsafe fn stores() -> StorePlaces<Area> {
     let first = place(Side::First);
     match running() {
         Some(slot) => StorePlaces { first, second: Some(place(Side::Second)), own: Stores::of(slot) },
-        // Without a loader, slot A may hold a firmware, but it does not run.
+        // Without a loader the program runs from the beginning of the first bank, and slot A may still contain a
+        // firmware that does not run.
         None => StorePlaces { first, second: None, own: Side::First },
     }
 }
@@ -73,7 +75,7 @@ pub(super) unsafe fn stores() -> StorePlaces<Area> {
 /// The slots.
 ///
 /// # Safety
-/// To be called once.
+/// Must be called at most once: nothing else may write to the flash of an [`Area`].
 pub(super) unsafe fn slots() -> Site<Area> {
     let slots = match (running(), key()) {
         (Some(running), Some(key)) => {
@@ -92,21 +94,22 @@ pub(super) unsafe fn slots() -> Site<Area> {
     Site { board: BOARD.board, slots }
 }
 
-/// The public key of the loader.
+/// The public key in the loader; `None` if there is no mark or the flash cannot be read.
 fn key() -> Option<[u8; 32]> {
     let mut bytes = [0; 2 * WORD];
     for (part, address) in bytes.as_chunks_mut::<WORD>().0.iter_mut().zip((KEY..).step_by(WORD)) {
         if !can_read(address) {
             return None;
         }
-        // SAFETY: readable flash that nothing writes.
+        // SAFETY: an aligned flash word in the sector of the loader. It was just found readable, and this program never
+        // writes to that sector.
         *part = unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() };
     }
     bytes.strip_prefix(&KEY_MARK)?.first_chunk().copied()
 }
 
 impl Area {
-    /// Address of a word; that of the first sector if the sector does not exist.
+    /// Address of a word. A sector that does not exist is replaced by the first one.
     fn address(&self, FlashWord { sector, word }: FlashWord) -> usize {
         let [first, ..] = self.sectors;
         let start = self.sectors.get(usize::from(sector)).copied().unwrap_or(first);
@@ -114,7 +117,7 @@ impl Area {
     }
 }
 
-/// Index of the bank of an address in the registers, and of its sector in the bank.
+/// Index of the bank that contains this address, and index of the sector in that bank, as the registers count them.
 fn bank_and_sector(address: usize) -> (usize, u8) {
     let offset = address - FLASH_START;
     (offset / BANK_SIZE, (offset % BANK_SIZE / BOARD.sector as usize) as u8)
@@ -129,7 +132,8 @@ fn unlock(bank: usize) {
     bank.ccr().write_value(ALL_FLAGS);
 }
 
-/// Waits for the bank, then locks it. An operation that does not end in time is found when the word is read back.
+/// Waits until the bank is ready, then locks it. An operation that does not end in time is found when the word is read
+/// back.
 async fn finish(bank: usize, wait: Wait) {
     let begun = Instant::now();
     loop {
@@ -149,7 +153,8 @@ async fn finish(bank: usize, wait: Wait) {
 impl SlotFlash for Area {
     fn whole(&self, place: FlashWord) -> Option<Word> {
         let address = self.address(place);
-        // SAFETY: a word of this area in flash, which is readable, and written by nobody else.
+        // SAFETY: the address is that of an aligned flash word of this area, just found readable. Only this area writes
+        // to it, for which it is borrowed mutably.
         can_read(address)
             .then(|| unsafe { core::ptr::with_exposed_provenance::<Word>(address).read_volatile() })
     }
@@ -175,7 +180,8 @@ impl recipe_store::Flash for Area {
         barrier();
         let start = core::ptr::with_exposed_provenance_mut::<u32>(address);
         for (index, part) in word.as_chunks().0.iter().enumerate() {
-            // SAFETY: within the word, in flash that is this area's alone; the bank is unlocked for it.
+            // SAFETY: `index` is below 8, so the address is within one flash word of this area. No other `Area` of this
+            // flash exists (see `stores` and `slots`), and its bank was unlocked for programming above.
             unsafe { start.add(index).write_volatile(u32::from_le_bytes(*part)) }
         }
         barrier();
@@ -200,8 +206,9 @@ impl recipe_store::Flash for Area {
 impl StoreFlash for Area {
     fn bytes(&mut self, found: FoundRecord) -> Option<&[u8]> {
         let start = self.address(found.data);
-        // SAFETY: the record lies in one sector. It is not changed while it is borrowed: writing takes `&mut self`.
-        // All its words were read when the store was opened, or written and read back since.
+        // SAFETY: a record is contiguous, because it is within one sector. It does not change while it is borrowed,
+        // because writing takes `&mut self`. All its words are readable: each was read when the store was opened, or
+        // was written and read back since.
         Some(unsafe { core::slice::from_raw_parts(core::ptr::with_exposed_provenance(start), found.len) })
     }
 }
@@ -221,7 +228,8 @@ pub(super) fn block_on<T>(operation: impl Future<Output = T>, mut feed: impl FnM
         if let Poll::Ready(result) = operation.as_mut().poll(&mut context) {
             return result;
         }
-        // An alarm before this instruction is not missed: the end of an interrupt is an event.
+        // An alarm that occurs just before this instruction is not missed: the return from its interrupt sets the event
+        // that ends WFE.
         cortex_m::asm::wfe();
     }
 }

@@ -16,7 +16,7 @@ pub(crate) fn seed() -> u64 {
     (0..2).fold(own, |seed, _| seed.rotate_left(32) ^ u64::from(random_word().unwrap_or(0)))
 }
 
-/// Random bytes; `None` if the generator fails, or has failed.
+/// Random bytes; `None` if the generator fails or reports an earlier failure.
 pub(super) fn random() -> Option<[u8; 32]> {
     start_generator();
     let mut bytes = [0; 32];
@@ -24,7 +24,7 @@ pub(super) fn random() -> Option<[u8; 32]> {
     let mut before = 0;
     for word in words {
         let random = random_word()?;
-        // RM0433, "True random number generator": the first word after an error is the one before, or 0.
+        // RM0433, "True random number generator": the first word after an error repeats the previous one, or is 0.
         if random == before {
             return None;
         }
@@ -37,7 +37,7 @@ pub(super) fn random() -> Option<[u8; 32]> {
 
 fn start_generator() {
     RCC.ahb2enr().modify(|w| w.set_rngen(true));
-    // Enabling the clock takes two cycles; earlier writes are lost.
+    // Enabling the clock takes two cycles; writes to the generator before that are lost.
     RCC.ahb2enr().read();
     RNG.cr().modify(|w| w.set_rngen(true));
 }

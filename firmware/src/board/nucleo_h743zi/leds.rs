@@ -37,7 +37,7 @@ impl Leds {
     }
 }
 
-/// Switches LD3 on, also if the fault occurred before anything was set up.
+/// Switches LD3 on. Works even if the fault occurred before the pins were set up.
 pub(super) fn fault() {
     RCC.ahb4enr().modify(|w| w.set_gpioben(true));
     // Enabling the clock takes two cycles.

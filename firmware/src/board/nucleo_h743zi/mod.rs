@@ -136,7 +136,8 @@ pub(crate) fn run<const N: usize>(start: impl FnOnce(Spawner, NucleoH743zi) -> T
     clocks::errata();
     let mut core = Core::take();
     if let Some(core) = &mut core {
-        // The data cache stays off, because the Ethernet DMA and the debugger access memory directly.
+        // Only the instruction cache is enabled: the Ethernet DMA and the debugger access memory directly, past a data
+        // cache.
         core.SCB.enable_icache();
     }
     let watchdog = Watchdog::start();
@@ -169,9 +170,11 @@ pub(crate) fn run<const N: usize>(start: impl FnOnce(Spawner, NucleoH743zi) -> T
         link: Some(leds.link),
         status: Some(leds.status),
         watchdog: Some(watchdog),
-        // SAFETY: the only call; a second one of this function has ended in `embassy_stm32::init`.
+        // SAFETY: this is the only call, and it is executed once: a second call of `run` panics in
+        // `embassy_stm32::init`.
         stores: Some(unsafe { flash::stores() }),
-        // SAFETY: the only call; slots and stores do not overlap (a test of the layout).
+        // SAFETY: this is the only call, and it is executed once, as above. A test of the layout checks that slots and
+        // stores do not overlap.
         slots: Some(unsafe { flash::slots() }),
         button: Some(UserButton::new(p.PC13)),
     };
@@ -196,7 +199,7 @@ fn log_start(source: clocks::ClockSource) {
     }
 }
 
-/// Also reached by panics. Waits for the watchdog's reset, so that a debugger can be attached.
+/// Handles faults and panics. Waits for the watchdog's reset, which leaves time to attach a debugger.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
     Watchdog::ensure_running();

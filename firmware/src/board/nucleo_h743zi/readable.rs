@@ -1,7 +1,7 @@
 //! Whether a word of the flash can be read: one that a power cut has torn, or that was programmed twice, has no valid
 //! error correction code, and reading it is a bus fault. RM0433, "Embedded Flash memory".
 //!
-//! The loader has this file too (firmware/boot/src/board/nucleo_h743zi/mod.rs).
+//! The loader compiles this file too (firmware/boot/src/board/nucleo_h743zi/mod.rs).
 
 use core::arch::asm;
 
@@ -11,8 +11,8 @@ use cortex_m::peripheral::SCB;
 pub(super) fn can_read(address: usize) -> bool {
     const CCR_IGNORE_BUS_FAULTS: u32 = 1 << 8;
     const CFSR_BUS: u32 = 0xBF << 8;
-    // SAFETY: during one load from flash all interrupts and faults are masked, so that a bus fault only sets its
-    // flag. The flag is cleared, and everything else restored.
+    // SAFETY: all interrupts and faults are masked during one load from flash, and bus faults are ignored, so a bus
+    // fault only sets its flag. Afterwards the flag is cleared and all other state is restored.
     unsafe {
         let scb = &*SCB::PTR;
         let control = scb.ccr.read();
@@ -22,7 +22,8 @@ pub(super) fn can_read(address: usize) -> bool {
         cortex_m::asm::isb();
         core::ptr::with_exposed_provenance::<u32>(address).read_volatile();
         cortex_m::asm::dsb();
-        // No flag was set before: elsewhere bus faults are not ignored and end the program.
+        // The flags are those of this load: everywhere else bus faults are not ignored, so one would have ended the
+        // program.
         let faults = scb.cfsr.read() & CFSR_BUS;
         if faults != 0 {
             scb.cfsr.write(faults);

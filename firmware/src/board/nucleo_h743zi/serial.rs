@@ -16,12 +16,14 @@ pub(crate) struct UsartRegisters(usart::Usart);
 
 impl UsartBlock for UsartRegisters {
     fn read(&self, offset: u8) -> u32 {
-        // SAFETY: the driver's offsets are registers of the USART, aligned.
+        // SAFETY: the driver passes only offsets of USART registers, which are multiples of 4 and within the
+        // peripheral.
         unsafe { self.0.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().read_volatile() }
     }
 
     fn write(&self, offset: u8, value: u32) {
-        // SAFETY: a register at an aligned offset; without DMA a USART accesses no memory.
+        // SAFETY: the driver passes only offsets of USART registers, which are multiples of 4 and within the
+        // peripheral. No DMA is used, so the USART accesses no memory.
         unsafe { self.0.as_ptr().cast::<u8>().add(usize::from(offset)).cast::<u32>().write_volatile(value) }
     }
 }
@@ -87,9 +89,9 @@ impl Lines {
     }
 }
 
-/// Connects transmit, receive and driver-enable to the USART. It has to run already, because its driver-enable is
-/// active before. The receive pin has a pull-up, because the transceiver's output floats while it sends and must
-/// not be taken for a start bit.
+/// Connects transmit, receive and driver-enable to the USART. The USART must be running already, because its
+/// driver-enable output is active before that. The receive pin has a pull-up: the transceiver's output floats while it
+/// sends, and must not be taken for a start bit.
 fn connect(pins: [Flex<'static>; 3]) {
     const FUNCTION: u8 = 7;
     let output = AfType::output(OutputType::PushPull, Speed::High);
@@ -100,6 +102,7 @@ fn connect(pins: [Flex<'static>; 3]) {
 }
 
 fn enable<I: Interrupt>() {
-    // SAFETY: its handler is bound; critical sections are not affected.
+    // SAFETY: both callers' interrupts have a bound handler. Critical sections disable all interrupts with PRIMASK, so
+    // unmasking one in the NVIC does not break them.
     unsafe { I::enable() }
 }

@@ -1,8 +1,7 @@
-//! The configuration image that a probe has written: in the second flash bank, at `_config_start` (memory.x).
+//! The configuration image that a debug probe has written: in the second flash bank, at `_config_start` (memory.x).
 //!
-//! A flash word that was programmed twice, or not completely because of a power failure, has no valid error
-//! correction code, and reading it is a bus fault. So each flash word of the image is first read once with bus
-//! faults ignored.
+//! A flash word that was programmed twice, or incompletely because of a power failure, has no valid error correction
+//! code, and reading it causes a bus fault. So each flash word of the image is first read once with bus faults ignored.
 
 use core::fmt;
 
@@ -22,7 +21,7 @@ const _: () = assert!(HEADER <= FLASH_WORD);
 /// Why there is no image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum StorageError {
-    /// A flash word of it cannot be read.
+    /// A flash word of the image cannot be read.
     Torn { address: usize },
 }
 
@@ -39,15 +38,17 @@ impl fmt::Display for StorageError {
     }
 }
 
-/// The image, or the first flash word if that is not the header of an image.
+/// The image; if there is no header of an image, only the first flash word.
 pub(super) fn read() -> Result<&'static [u8], StorageError> {
     let start = &raw const _config_start;
     check(start.addr(), FLASH_WORD)?;
-    // SAFETY: one flash word, found readable; nothing writes this sector.
+    // SAFETY: `start` is the address of a flash word that was just found readable. The program never writes to this
+    // sector.
     let header = unsafe { core::slice::from_raw_parts(start, FLASH_WORD) };
     let len = image_len(header).map_or(FLASH_WORD, |len| len.clamp(HEADER, MAX_IMAGE));
     check(start.addr(), len)?;
-    // SAFETY: `len` bytes were found readable and are not written; an image is shorter than the region.
+    // SAFETY: `len` bytes from `start` were found readable, and the program never writes to this sector. They are
+    // within its region, because `len` is at most `MAX_IMAGE`, which is less than the region.
     Ok(unsafe { core::slice::from_raw_parts(start, len) })
 }
 

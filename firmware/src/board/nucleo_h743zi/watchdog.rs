@@ -26,21 +26,22 @@ impl Watchdog {
     pub(super) fn start() -> Self {
         // It stops while a debugger halts the core.
         DBGMCU.apb4fzr1().modify(|w| w.set_iwdg1(true));
-        // SAFETY: called once; nothing else uses it.
+        // SAFETY: this is the only handle: `start` is called once, and the register accesses below only write keys,
+        // which do not interfere with it.
         let device = unsafe { IWDG1::steal() };
         let mut watchdog = IndependentWatchdog::new(device, PERIOD.as_micros() as u32);
         watchdog.unleash();
         Self(watchdog)
     }
 
-    /// Starts it if it is not running, for a fault that occurs before the start: with its shortest divider it
-    /// resets after half a second.
+    /// Starts the watchdog if a fault occurs before it was started. With its shortest divider it resets the board
+    /// after half a second.
     pub(super) fn ensure_running() {
         IWDG1_REGISTERS.kr().write(|w| w.set_key(Key::START));
     }
 }
 
-/// Feeds it where the start waits for the flash, before the task that feeds it runs.
+/// Feeds the watchdog while the start waits for the flash, before the task that feeds it runs.
 pub(super) fn feed_during_start() {
     IWDG1_REGISTERS.kr().write(|w| w.set_key(Key::RESET));
     FED.store(millis(), Ordering::Relaxed);
@@ -56,7 +57,7 @@ impl FeedWatchdog for Watchdog {
     }
 }
 
-/// Starts the SysTick handler, twelve times a second. The clock has to run already.
+/// Starts the SysTick interrupt, twelve times a second. The clock must be running already.
 pub(super) fn supervise(timer: &mut SYST) {
     FED.store(millis(), Ordering::Relaxed);
     timer.set_clock_source(SystClkSource::External);
@@ -70,7 +71,7 @@ pub(super) fn supervise(timer: &mut SYST) {
 fn SysTick() {
     let unfed = millis().wrapping_sub(FED.load(Ordering::Relaxed));
     let is_late = u64::from(unfed) >= PERIOD.as_millis() / 2;
-    // Only once, because a reset during the write would destroy the record.
+    // Saved only once per hang, because a reset while the record is written would destroy it.
     if is_late && !IS_LATE.swap(true, Ordering::Relaxed) {
         crash_record::save_hang();
     }
@@ -81,7 +82,7 @@ fn millis() -> u32 {
 }
 
 static FED: AtomicU32 = AtomicU32::new(0);
-/// A hang was saved, which a feed may still disprove.
+/// A hang was saved. It is cleared if the watchdog is fed after all.
 static IS_LATE: AtomicBool = AtomicBool::new(false);
-/// Cycles of an eighth of the core's clock, from one look to the next.
+/// Period of the SysTick interrupt, in cycles of an eighth of the core's clock.
 const EIGHTHS: u32 = 4_000_000;
