@@ -6,7 +6,7 @@
 //!
 //! Messages from [`info!`](crate::info) on are also stored as text ([`crate::journal`]).
 //!
-//! Only `{}` with arguments after the text has the same meaning in both.
+//! Messages use only `{}` with arguments after the text, which has the same meaning in both crates.
 
 use core::fmt;
 
@@ -49,7 +49,7 @@ macro_rules! error {
     }};
 }
 
-/// Logs what is repeated so often that it would push everything else out of the journal.
+/// Logs messages so frequent that they would push everything else out of the journal.
 #[macro_export]
 macro_rules! traffic {
     ($($text_and_values:tt)*) => { $crate::log_at!(info, $($text_and_values)*) };
@@ -69,7 +69,7 @@ macro_rules! log_at {
     ($level:ident, $($text_and_values:tt)*) => { ::log::$level!($($text_and_values)*) };
 }
 
-/// Logs a value as the text that it displays, with both crates: for errors, whose texts exist once.
+/// Logs the `Display` text of a value, with both crates. Used for errors, so that their texts exist only once.
 #[derive(Debug, Clone, Copy)]
 pub struct DisplayText<'a, T>(pub &'a T);
 

@@ -33,7 +33,7 @@ struct Ring {
 
 static RING: Mutex<RefCell<Ring>> = Mutex::new(RefCell::new(Ring { bytes: Deque::new(), dropped: 0 }));
 
-/// Appends a line. Takes a critical section; not for interrupts with tight deadlines.
+/// Appends a line, in a critical section. Not to be called by interrupts with tight deadlines.
 #[inline(never)]
 pub fn note(level: Level, message: fmt::Arguments<'_>) {
     let mut line = String::<{ MAX_LINE - 1 }>::new();
@@ -65,7 +65,7 @@ pub fn read(from: u32, into: &mut [u8]) -> (usize, u32) {
 impl Ring {
     fn push(&mut self, line: &[u8]) {
         while self.bytes.capacity().saturating_sub(self.bytes.len()) < line.len().saturating_add(1) {
-            // Whole lines.
+            // Drop whole lines only.
             while let Some(byte) = self.bytes.pop_front() {
                 self.dropped = self.dropped.wrapping_add(1);
                 if byte == b'\n' {
@@ -92,7 +92,7 @@ impl Ring {
     }
 
     fn read(&self, from: u32, into: &mut [u8]) -> (usize, u32) {
-        // A distance above the ring's length is a dropped position.
+        // A distance of more than the capacity means that the bytes at this position were dropped.
         let skipped = from.wrapping_sub(self.dropped);
         let skipped = if skipped as usize > CAPACITY { 0 } else { skipped };
         let mut count = 0_usize;

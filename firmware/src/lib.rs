@@ -3,9 +3,9 @@
 //! The recipe gateway on a board: tasks that move bytes, frames and events between drivers and the
 //! engine of `proto-core`.
 //!
-//! Nothing here knows a protocol or a board: every task is generic over `embedded_io_async`,
-//! [`drivers::can_port::CanPort`] or an `embassy_net::Stack`, and its memory is bounded. The binary chooses the
-//! board.
+//! Does not know protocols or boards: every task is generic over `embedded_io_async`, [`drivers::can_port::CanPort`] or
+//! an
+//! `embassy_net::Stack`, and its memory is bounded. The binary chooses the board.
 
 mod clock;
 pub mod drivers;

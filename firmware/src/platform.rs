@@ -1,6 +1,6 @@
 //! What a board provides for the tasks: the only interface between them and a chip.
 //!
-//! A board hands out its devices, each once. It knows no protocol. How to add a board, and how to test it, is in
+//! A board hands out each of its devices once. It does not know protocols. How to add and test a board is in
 //! docs/boards.md.
 
 use core::fmt::{self, Debug, Display};
@@ -61,9 +61,9 @@ impl Ports {
 
 /// A board.
 ///
-/// It exists when clocks, memory, the log and the watchdog are running. The methods that hand out devices
-/// are called during the start, before any device is used; `ethernet` is called last, so that the field buses
-/// run without a PHY. What they return has a type of the board's own, because a task cannot be generic.
+/// A value of this type exists only after clocks, memory, the log and the watchdog are running. The methods that hand
+/// out devices are called during the start, before any device is used; `ethernet` is called last, so that the field
+/// buses run even without a PHY. Each method returns one concrete type of the board, because a task cannot be generic.
 pub trait Board {
     /// Name of the board in firmware headers.
     const NAME: &'static str;
@@ -71,8 +71,8 @@ pub trait Board {
     const SERIAL_PORTS: usize;
     /// Number of CAN buses, assigned likewise.
     const CAN_PORTS: usize;
-    /// Timeout of the watchdog: at least 4 s, since tasks are checked four times in it, and may take a second to
-    /// answer.
+    /// Timeout of the watchdog: at least 4 s, because tasks are checked four times per timeout, and may take a second
+    /// to answer.
     const WATCHDOG_PERIOD: Duration;
 
     /// The configuration image written to the board by a probe or a file, which is adopted into the store. Trailing
@@ -86,12 +86,12 @@ pub trait Board {
     /// above.
     fn flash(&mut self) -> Option<StorePlaces<impl StoreFlash + 'static>>;
 
-    /// The slots of the firmware (docs/update.md), with the flash of the one that the program does not run in; called
-    /// once.
+    /// The slots of the firmware (docs/update.md) and their flash; called once. The program runs in one of them, and
+    /// the other one can be written.
     fn slots(&mut self) -> Site<impl SlotFlash + 'static>;
 
-    /// Waits for the flash during the start, when no task runs yet. A sector may take two seconds, so the watchdog
-    /// is fed meanwhile; each operation of the flash has a time limit.
+    /// Waits for the flash during the start, when no task runs yet. Erasing a sector may take two seconds, so the
+    /// watchdog is fed meanwhile. This cannot hide a hang, because each flash operation has a time limit.
     fn block_on<T>(&mut self, operation: impl Future<Output = T>) -> T;
 
     /// The next RS-485 line, with these settings; `None` if there is none left, or if it does not support the
@@ -116,11 +116,11 @@ pub trait Board {
     /// A seed for local port numbers, different at each start.
     fn seed(&mut self) -> u64;
 
-    /// Unpredictable random bytes for the console's nonces; `None` if the board has no source, and then no console. The
-    /// clock and the chip's serial number are no such sources.
+    /// Unpredictable random bytes for the console's nonces; `None` if the board has no source of them, and then it has
+    /// no console. The clock and the chip's serial number are not unpredictable.
     fn random(&mut self) -> Option<[u8; 32]>;
 
-    /// The button that lets the board take a key; called once.
+    /// The button that permits a client to set the access key; called once.
     fn button(&mut self) -> impl Button + 'static;
 
     /// Highest stack use so far, in bytes.

@@ -178,7 +178,7 @@ struct Wiring {
     network: Option<Network>,
 }
 
-/// Memory for the configuration during the start, and for the buffers of the tasks afterwards.
+/// Memory that the configuration uses during the start, and the buffers of the tasks afterwards.
 #[allow(clippy::large_enum_variant, reason = "both share one memory")]
 #[repr(u8)]
 enum Overlay {
@@ -187,7 +187,7 @@ enum Overlay {
 }
 
 impl Overlay {
-    /// All zeros, so that it takes no flash.
+    /// The initial value, all zeros, so that the static takes no flash.
     const ZEROED: Self = Self::Configuration(GatewayConfig::empty());
 
     fn configuration(&mut self) -> &mut GatewayConfig {
@@ -206,7 +206,7 @@ impl Overlay {
     }
 }
 
-/// An image on its way to the store, and the sockets of links, edge node and console.
+/// Size of the buffers: an image to be stored, and the sockets of links, edge node and console.
 const BUFFERS: usize =
     MAX_IMAGE + LinkBuffers::ALL + edge::NodeBuffers::SIZE + CONNECTIONS * console::ConnectionBuffers::SIZE;
 
@@ -250,7 +250,7 @@ fn run_ports(
                 let missing = CannotRun::NoDevice(NoDevice { port: id.0, bus: "CAN", available: CAN_PORTS });
                 let _ = can_ports.push((*id, board.can(*bitrate).ok_or(missing)?));
             }
-            // These have links.
+            // These ports have links instead of devices of the board.
             Bus::ModbusTcp { .. } | Bus::TcpListen { .. } | Bus::UdpListen { .. } => {}
         }
     }
@@ -265,8 +265,8 @@ fn run_ports(
     Ok(())
 }
 
-/// Starts the network, the console, the links of what runs, and the edge node. It is last, so that the field buses run
-/// without a PHY.
+/// Starts the network, the console, the links of the running configuration, and the edge node. Called last, so that the
+/// field buses run even without a PHY.
 #[inline(never)]
 #[allow(clippy::too_many_arguments, reason = "each is used once")]
 fn connect(
@@ -365,7 +365,7 @@ fn network_config(own: Option<Network>, name: &str) -> Config {
     })
 }
 
-/// The only task without a pulse.
+/// Feeds the watchdog. It is the only task without a pulse, because it checks the pulses of the others.
 #[embassy_executor::task]
 async fn feeder(watch: &'static TaskWatch<MAX_TASKS>, mut dog: Watchdog) -> ! {
     watchdog::run(watch, WATCHDOG_PERIOD, || dog.feed()).await
@@ -406,7 +406,7 @@ async fn controller_link(
 
 #[embassy_executor::task]
 async fn network(pulse: &'static Pulse, mut runner: Runner<'static, Fair<'static, Ethernet>>) -> ! {
-    // The stack's own waits cannot be wrapped; the check is only that polling it returns.
+    // The waits inside the network stack cannot be wrapped, so the check is only that polling the stack returns.
     let mut running = pin!(runner.run());
     pulse.run(pin!(pulse.idle(running.as_mut()))).await
 }
@@ -472,7 +472,7 @@ async fn time_server(
 async fn address(pulse: &'static Pulse, stack: Stack<'static>) -> ! {
     let log = async {
         loop {
-            // A fixed address exists before the link is up, but cannot be reached yet.
+            // Wait for the link first: a fixed address is configured before the link is up, but cannot be reached yet.
             pulse.idle(pin!(stack.wait_link_up())).await;
             pulse.idle(pin!(stack.wait_config_up())).await;
             if let Some(config) = stack.config_v4() {
@@ -504,7 +504,7 @@ async fn store_task(
     cortex_m::peripheral::SCB::sys_reset()
 }
 
-/// Logs the reason repeatedly: a reader of the log may come late.
+/// Logs repeatedly why no configuration runs, because a reader of the log may connect late.
 #[embassy_executor::task]
 async fn refused(pulse: &'static Pulse, reason: CannotRun) -> ! {
     let what = if matches!(reason, CannotRun::Ethernet(_)) { "no controller" } else { "nothing runs" };
@@ -517,12 +517,13 @@ async fn refused(pulse: &'static Pulse, reason: CannotRun) -> ! {
     pulse.run(pin!(log)).await
 }
 
-/// One for each link and connection, the broker, the time server, DHCP and DNS.
+/// Number of sockets: one for each link and connection, the broker, the time server, DHCP and DNS.
 const SOCKETS: usize = MAX_LINKS + CONNECTIONS + 4;
 /// Interval of that log line.
 const REPEAT: Duration = Duration::from_secs(10);
-/// A task for each port, link and connection, and: engine, network, address, status, LED, refused, store, button,
-/// edge node, time, the board's own.
+/// Maximum number of tasks: one for each port, link and connection, and one each for: engine, network, address, status,
+/// LED, refused configuration, store, button, edge node, time, the board's own.
 const MAX_TASKS: usize = SERIAL_PORTS + CAN_PORTS + MAX_LINKS + CONNECTIONS + 11;
-// The queue of timers (`generic-queue-32`) has one for each of them, for the watchdog's own, and for the start.
+// The timer queue (`generic-queue-32`) needs an entry for each task, for the task that feeds the watchdog, and for the
+// start.
 const _: () = assert!(MAX_TASKS + 2 <= 32);

@@ -14,7 +14,7 @@ use recipe_store::{
     Role, Side, SlotMarks, Store, Trial, TrialEnd, WORD, newest,
 };
 
-/// Flash that can lend the bytes of a record.
+/// Flash that can return a reference to the data of a record.
 pub trait StoreFlash: Flash {
     /// The data of a record; `None` if it has been replaced.
     fn bytes(&mut self, found: FoundRecord) -> Option<&[u8]>;
@@ -25,7 +25,7 @@ pub trait StoreFlash: Flash {
 pub struct StorePlaces<F> {
     /// The first place.
     pub first: F,
-    /// The second one, if the board has slots for its firmware.
+    /// The second place, if the board has slots for its firmware.
     pub second: Option<F>,
     /// The place in the bank that the program does not run from.
     pub own: Side,
@@ -43,7 +43,7 @@ impl<F> StorePlaces<F> {
 pub struct StoredConfig<F> {
     store: Store,
     flash: F,
-    /// Target of a move, if the store is in the wrong bank.
+    /// The place to move to, if the store is in the bank that the program runs from.
     to: Option<F>,
 }
 
@@ -99,10 +99,10 @@ impl<F: StoreFlash> StoredConfig<F> {
         self.to.is_some()
     }
 
-    /// Moves the store to its own bank; does nothing if it is there.
+    /// Moves the store to the bank that the program does not run from; does nothing if it is there already.
     ///
     /// # Errors
-    /// The store stays where it was.
+    /// The move failed; the store stays where it was.
     pub async fn move_home(&mut self) -> Result<(), PutError> {
         let Some(mut to) = self.to.take() else { return Ok(()) };
         self.store = self.store.relocate().execute(&self.flash, &mut to).await?;
@@ -153,7 +153,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// It cannot be written; the live configuration is unchanged.
     pub async fn adopt(&mut self, digest: u32, image: &[u8]) -> Result<bool, KeepError> {
         let mut is_new = false;
-        // Three writes: image, marks, note. Each may have to make room first.
+        // An adoption has three writes: image, marks, and a record of the adoption. Each may have to make room first.
         for _ in 0..4 + MAX_REVISIONS {
             match self.store.adopt(digest, image) {
                 Ok(Adoption::Write(put)) => put.execute(&mut self.flash).await?,
@@ -168,11 +168,11 @@ impl<F: StoreFlash> StoredConfig<F> {
         Ok(is_new)
     }
 
-    /// The configurations to try, in order. A start of a trial is counted before it runs, to bound crashes; if it
-    /// cannot be counted, the trial is not run.
+    /// The configurations to try, in order. Each start of a configuration on trial is counted before it runs, to limit
+    /// the number of crashes. If the start cannot be counted, the configuration on trial is not run.
     ///
     /// # Errors
-    /// The start could not be counted. `candidates` then has only the others.
+    /// The start could not be counted. `candidates` then contains only the other configurations.
     pub async fn candidates(&mut self, candidates: &mut Vec<(Revision, Role), 3>) -> Result<(), KeepError> {
         let start = self.store.at_start();
         *candidates = start.candidates;
@@ -196,7 +196,7 @@ impl<F: StoreFlash> StoredConfig<F> {
     /// Ends the trial: the next start runs the live one.
     ///
     /// # Errors
-    /// It cannot be written. Starts of a trial are counted, so it ends nevertheless.
+    /// The marks cannot be written. The trial still ends, at the latest when its counted starts are used up.
     pub async fn end_trial(&mut self, ended: TrialEnd) -> Result<(), KeepError> {
         let marks = self.store.marks();
         let last = marks.trial.map(|trial| (trial.number, ended)).or(marks.last);
@@ -223,7 +223,7 @@ impl<F: StoreFlash> StoredConfig<F> {
         forget: Option<u32>,
     ) -> Result<(), KeepError> {
         let marks = self.store.marks();
-        // The mark refers to the place, which gets another configuration.
+        // This mark refers to the place of `forget`, which gets another configuration.
         if forget.is_some() && marks.last.map(|(number, _)| number) == forget {
             self.mark(Marks { last: None, ..marks }).await?;
         }
@@ -312,10 +312,10 @@ pub fn image_version(head: &[u8]) -> Option<u32> {
     head.get(image::MAGIC.len()..)?.first_chunk().map(|version| u32::from_le_bytes(*version))
 }
 
-/// Starts of a trial: one, and two more after power cuts.
+/// Number of starts that a trial has: one, and two more in case of power cuts.
 const STARTS: u8 = 3;
 
-/// Duration of a trial.
+/// Duration of the trial; `None` if the configuration is not on trial.
 pub fn trial_time(role: Role) -> Option<Duration> {
     match role {
         Role::Trial { confirm_s } => Some(Duration::from_secs(confirm_s.into())),

@@ -43,7 +43,7 @@ pub enum UpdateError {
     Cannot(&'static str),
     /// Invalid header.
     Header(HeaderError),
-    /// The piece at offset 0 is not exactly the header.
+    /// The piece at offset 0 is not exactly as long as the header.
     Alone,
     /// The firmware may not be installed.
     Rule(recipe_update::UpdateRefused),
@@ -71,7 +71,7 @@ pub enum UpdateError {
 }
 
 impl UpdateError {
-    /// Whether the request itself is wrong, not only its moment.
+    /// Whether the request itself is invalid, as opposed to refused only at this time.
     pub fn is_wrong(&self) -> bool {
         match self {
             Self::Rule(recipe_update::UpdateRefused::OnTrial | recipe_update::UpdateRefused::NotGood) => {
@@ -203,8 +203,8 @@ impl<S: SlotFlash> Updates<S> {
         Ok(RunningFirmware { board: self.board, slot, version: VERSION, kept })
     }
 
-    /// Accepts a piece. At `offset` 0 it is the header; the header of the firmware that is being received, or is
-    /// complete in its slot, changes nothing.
+    /// Accepts a piece. The piece at `offset` 0 is the header. If it is the header of the firmware that is already
+    /// being received, or is complete in its slot, nothing changes.
     pub async fn take(
         &mut self,
         offset: u32,
@@ -277,7 +277,7 @@ impl<S: SlotFlash> Updates<S> {
                     incoming.stage = UpdateStage::Checking;
                     break;
                 }
-                // A short firmware is checked at once.
+                // A short firmware is checked in a single step.
                 ReceiveStep::End(Ok(())) => {
                     incoming.stage = UpdateStage::Ready;
                     self.receive = None;
@@ -483,7 +483,7 @@ pub const VERSION: Version = Version::new(
     number(env!("CARGO_PKG_VERSION_PATCH")),
 );
 
-/// A number of the package's version. Checked when it is compiled.
+/// Parses a part of the package's version, at compile time.
 const fn number(digits: &str) -> u16 {
     match u16::from_str_radix(digits, 10) {
         Ok(number) => number,
@@ -496,7 +496,7 @@ pub const FORMATS: Formats =
     Formats { oldest: image::OLDEST_VERSION, newest: image::VERSION, written: image::VERSION };
 /// How long all conditions must hold before a trial is confirmed.
 pub const LASTS: Duration = Duration::from_secs(10);
-/// Words written before yielding, for flash whose writes complete at once.
+/// Number of words written before yielding. Without it, flash whose writes complete at once would never yield.
 const WORDS: u32 = 16;
 
 #[cfg(test)]

@@ -21,8 +21,8 @@ pub trait CanPort {
     /// [`BusOff`] if the controller is bus-off; `receive` then does not report that again.
     async fn send(&mut self, frame: &CanFrame) -> Result<(), BusOff>;
 
-    /// Drops the queued frames, and after bus-off starts the recovery. `receive` reports when the controller is back
-    /// on the bus, which on a disturbed bus may be never.
+    /// Drops the queued frames; after bus-off also starts the recovery. `receive` reports when the controller is back
+    /// on the bus. On a disturbed bus that may never happen.
     fn recover(&mut self);
 
     /// Sets the acceptance filters and joins the bus. Frames with other ids need not be received; a controller
@@ -43,7 +43,7 @@ pub trait CanPort {
 pub enum CanEvent<F> {
     /// A frame.
     Frame(F),
-    /// Its error state changed.
+    /// The error state of the controller changed.
     Bus(BusState),
     /// All queued frames have left.
     Sent,
@@ -60,6 +60,6 @@ pub struct CanCounters {
     pub transmit_errors: u8,
     /// The receive error counter of the CAN standard.
     pub receive_errors: u8,
-    /// Times that a frame was lost because it was not read from the controller in time. Wraps.
+    /// How often frames were lost because they were not read from the controller in time. Wraps.
     pub lost: u32,
 }

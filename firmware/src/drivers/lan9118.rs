@@ -126,7 +126,7 @@ impl<R: Lan9118Registers> Lan9118<R> {
             let length = (status >> 16 & 0x3FFF) as usize;
             let good = status & RX_ERROR == 0 && (CRC..=MTU + CRC).contains(&length);
             let mut words = self.rx.chunks_exact_mut(4);
-            // A bad frame is read too: there is no other way to skip it that works on all controllers.
+            // A bad frame is read too, because no other way to skip it works on all controllers.
             for _ in 0..length.div_ceil(4) {
                 let word = self.regs.read(RX_DATA);
                 if let Some(bytes) = words.next() {
@@ -151,11 +151,12 @@ impl<R: Lan9118Registers> Lan9118<R> {
         (info & 0xFFFF) as usize >= BUFFER
     }
 
-    /// Asks the PHY, and acknowledges its interrupt first, so that a change after this is not missed.
+    /// Reads the link state from the PHY. The PHY's interrupt is acknowledged first, so that later changes are not
+    /// missed.
     fn read_link(&self) -> Result<bool, Lan9118Error> {
         self.regs.write(INT_STS, INT_PHY);
         self.phy_read(PHY_INT_SOURCE)?;
-        // The bit latches a loss until it is read.
+        // Read twice: the bit latches a loss of the link until it is read.
         self.phy_read(PHY_BMSR)?;
         Ok(self.phy_read(PHY_BMSR)? & BMSR_LINK != 0)
     }
@@ -294,7 +295,7 @@ impl<R: Lan9118Registers> TxToken for Transmit<'_, R> {
 }
 
 const CRC: usize = 4;
-/// Polls of something that takes microseconds.
+/// Limit of polls of a register whose change takes microseconds.
 const MAX_POLLS: u32 = 100_000;
 
 const RX_DATA: u16 = 0x00;

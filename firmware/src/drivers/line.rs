@@ -4,7 +4,7 @@ use embedded_io_async::{Read, Write};
 
 /// A half-duplex line (D20).
 pub trait Line: Read + Write {
-    /// Switches driver-enable; does nothing if the hardware does it, or if there is none.
+    /// Switches driver-enable. Does nothing if the hardware controls driver-enable, or if there is none.
     fn drive(&mut self, direction: LineDirection) {
         let _ = direction;
     }

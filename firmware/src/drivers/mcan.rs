@@ -1,7 +1,7 @@
 //! Bosch M_CAN (the FDCAN of an STM32H7) as a CAN port, for classic frames.
 //!
-//! In: accesses to its registers and its message RAM through [`McanBlock`], and calls of
-//! [`Mcan::interrupt`]. Out: a [`CanPort`]. It knows no board and no pins.
+//! In: accesses to its registers and its message RAM through [`McanBlock`], and calls of [`Mcan::interrupt`]. Out: a
+//! [`CanPort`]. Does not know boards or pins.
 //!
 //! The message RAM has two receive FIFOs of 64 frames, so that none is lost within 3 ms at 1 Mbit/s, and a
 //! transmit FIFO for a whole cycle of 32. The id of a frame determines its receive FIFO, so frames of one id
@@ -158,7 +158,7 @@ impl<R: McanBlock> Mcan<R> {
         self.wait_for_init(0);
     }
 
-    /// Waits for INIT to cross to the CAN clock domain; later writes would be ignored before.
+    /// Waits until INIT has crossed to the CAN clock domain. Before that, other writes would be ignored.
     fn wait_for_init(&self, wanted: u32) {
         for _ in 0..MAX_POLLS {
             if self.regs.read(CCCR) & CCCR_INIT == wanted {
@@ -353,7 +353,7 @@ fn element(start: u16, index: u32) -> u16 {
     start.saturating_add(ELEMENT_WORDS.saturating_mul(index as u16))
 }
 
-/// Polls of a bit that changes after some cycles of the CAN clock.
+/// Limit of polls of a bit that changes after some cycles of the CAN clock.
 const MAX_POLLS: usize = 10_000;
 
 #[cfg(test)]

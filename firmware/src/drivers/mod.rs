@@ -1,6 +1,6 @@
 //! The traits of devices that the tasks use, and drivers that implement them.
 //!
-//! A driver accesses its registers through a trait; it knows neither a board nor a task.
+//! A driver accesses its registers through a trait. It does not know boards or tasks.
 
 pub mod can_port;
 pub mod lan9118;

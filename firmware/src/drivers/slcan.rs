@@ -48,12 +48,12 @@ impl<D: Read + Write> SlcanPort<D> {
         frame
     }
 
-    /// Writes all pending output. What was written is removed at once, so nothing is sent twice.
+    /// Writes all pending output. Written bytes are removed at once, so nothing is sent twice.
     async fn write_out(&mut self) {
         while !self.output.is_empty() {
             match self.line.write(&self.output).await {
                 Ok(len) if len > 0 => remove(&mut self.output, len),
-                // A failure cannot be reported.
+                // Drop the output after a failure, because there is nobody to report it to.
                 _ => self.output.clear(),
             }
         }
@@ -76,7 +76,7 @@ impl<D: Read + Write> CanPort for SlcanPort<D> {
             if self.input.is_empty() {
                 let mut chunk = [0; CHUNK];
                 if let Ok(len) = self.line.read(&mut chunk).await {
-                    // `input` is empty and as long as the chunk.
+                    // Does not fail: `input` is empty, and its capacity is that of the chunk.
                     let _ = self.input.extend_from_slice(chunk.get(..len).unwrap_or(&[]));
                 }
             }
@@ -95,10 +95,10 @@ impl<D: Read + Write> CanPort for SlcanPort<D> {
         Ok(())
     }
 
-    /// There is no bus-off; pending output is written when the line accepts it.
+    /// Does nothing: there is no bus-off, and pending output is written when the line accepts it.
     fn recover(&mut self) {}
 
-    /// The client receives everything, and all its frames are received.
+    /// Does nothing: all frames of the client are received.
     fn set_filters(&mut self, _: &[CanId]) {}
 
     fn bitrate(&self) -> u32 {

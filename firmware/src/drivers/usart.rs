@@ -1,13 +1,13 @@
 //! An STM32 USART (with FIFOs, as in the H7) as an RS-485 line.
 //!
 //! In: register accesses through [`UsartBlock`], the line's settings, and calls of [`Usart::interrupt`].
-//! Out: a [`Line`]. It knows no board and no pins.
+//! Out: a [`Line`]. Does not know boards or pins.
 //!
-//! Interrupts are used instead of DMA, because each character with a parity or framing error has to be
-//! discarded: a recipe's stream has no checksum. Disturbed characters are usual when a half-duplex line changes
-//! direction, and must not stop the reception of the next ones. The receive FIFO is emptied when it is a quarter
-//! full, or when the line is idle for one character; 12 more characters fit in it meanwhile, 260 µs at 460800
-//! baud. The hardware controls driver-enable and releases it half a bit after the last stop bit.
+//! Interrupts are used instead of DMA, because each character with a parity or framing error has to be discarded: a
+//! recipe's stream has no checksum. Corrupted characters are common when a half-duplex line changes direction, and must
+//! not stop the reception of the next ones. The receive FIFO is emptied when it is a quarter full, or when the line is
+//! idle for one character. It then has room for 12 more characters, that is 260 µs at 460800 baud. The hardware
+//! controls driver-enable and releases it half a bit after the last stop bit.
 
 use core::cell::RefCell;
 use core::convert::Infallible;
@@ -147,8 +147,8 @@ impl<R: UsartBlock> UsartAccess<'_, R> {
         // Cleared before the FIFO is emptied, so that a later idle line interrupts again.
         self.regs.write(ICR, IDLE);
         let errors = &mut self.state.errors;
-        // Each character has its own error flags. They are cleared before the character is read, because
-        // afterwards they are those of the next.
+        // Each character has its own error flags. They are cleared before the character is read, because afterwards
+        // the flags belong to the next character.
         for _ in 0..MAX_AT_ONCE {
             let status = self.regs.read(ISR);
             if status & OVERRUN != 0 {
@@ -174,7 +174,7 @@ impl<R: UsartBlock> UsartAccess<'_, R> {
         }
     }
 
-    /// Fills the transmit FIFO. Wakes a flush when all characters have left.
+    /// Fills the transmit FIFO. Wakes the task in `flush` when all characters have left.
     fn transmit(&mut self) {
         while !self.state.waiting.is_empty() && self.regs.read(ISR) & TX_NOT_FULL != 0 {
             if let Some(byte) = self.state.waiting.pop_front() {
@@ -202,7 +202,7 @@ impl<R: UsartBlock> Read for Usart<R> {
     async fn read(&mut self, buf: &mut [u8]) -> Result<usize, Infallible> {
         poll_fn(|cx| {
             self.with(|line| {
-                // Less than a quarter of the FIFO causes no interrupt until the line is idle.
+                // Read the FIFO here too: up to a quarter of it causes no interrupt until the line is idle.
                 line.receive();
                 if line.state.received.is_empty() && !buf.is_empty() {
                     line.state.reader.register(cx.waker());
@@ -240,8 +240,8 @@ impl<R: UsartBlock> Write for Usart<R> {
         .await
     }
 
-    /// Waits for the end of the last stop bit. The caller (`serial::run`) gives up on a line that does not accept its
-    /// bytes; the next transmission follows the rest of this one.
+    /// Waits for the end of the last stop bit. The caller (`serial::run`) gives up waiting if the line does not accept
+    /// the bytes; the next transmission then follows the rest of this one.
     async fn flush(&mut self) -> Result<(), Infallible> {
         poll_fn(|cx| {
             self.with(|line| {
@@ -296,7 +296,7 @@ impl Speed {
 const RX_RING: usize = 1024;
 /// Characters buffered for the line: the longest frame.
 const TX_RING: usize = 512;
-/// Bound of one call, above the size of the FIFO.
+/// Maximum number of characters per call of the interrupt handler: more than fit into the FIFO.
 const MAX_AT_ONCE: usize = 32;
 
 const PRESCALERS: [u32; 12] = [1, 2, 4, 6, 8, 10, 12, 16, 32, 64, 128, 256];
@@ -342,7 +342,8 @@ const TX_COMPLETE: u32 = 1 << 6;
 // Flags of ISR only.
 const RX_NOT_EMPTY: u32 = 1 << 5;
 const TX_NOT_FULL: u32 = 1 << 7;
-/// Noise is cleared but not counted: the majority of the bit's samples was taken.
+/// Errors of a character, to be cleared. Noise is not counted, because the USART then takes the majority of the bit's
+/// samples.
 const CHARACTER_ERRORS: u32 = PARITY_ERROR | FRAMING_ERROR | NOISE;
 
 #[cfg(test)]

@@ -37,10 +37,10 @@ impl core::fmt::Display for CannotRun {
     }
 }
 
-/// Configures the gateway with the first configuration that can run: a new image outside the store; then, from the
-/// store, the one on trial, the live one, the previous one; then the image outside the store, although it was adopted
-/// before. Returns the length of the image. `work` gets the writes left to the store task, `failure` why the first
-/// candidate does not run.
+/// Configures the gateway with the first configuration that can run, and returns the length of its image. The order is:
+/// a new image outside the store; from the store, the configuration on trial, the live one, the previous one; the image
+/// outside the store even if it was adopted before. `work` gets the writes that are left to the store task, `failure`
+/// the reason why the first candidate does not run.
 ///
 /// Writes only the start of a trial, so that the start takes no longer than without a store.
 ///
@@ -59,7 +59,7 @@ pub(super) fn load(
         let (image, _) = own?;
         return configure(image, gateway, config);
     };
-    // A missing image is no failure if the store has a configuration.
+    // A missing image is not a failure if the store has a configuration.
     let mut why = own.err();
     if let Ok((image, digest)) = own
         && !stored.store().is_adopted(digest, image.len())
@@ -93,7 +93,7 @@ pub(super) fn load(
             Err(error) => {
                 error!("configuration {} of the store cannot run: {}", revision.number, DisplayText(&error));
                 work.trial_failed |= matches!(role, Role::Trial { .. });
-                // More useful than "no image".
+                // Report why the first candidate does not run, which is more useful than "no image".
                 if core::mem::take(&mut is_first) {
                     (why, *failure) = (Some(error), Some(error));
                 }

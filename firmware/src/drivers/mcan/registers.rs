@@ -2,7 +2,7 @@
 
 use proto_core::recipe::model::MAX_CAN_IDS;
 
-/// Size of the message RAM that the driver uses.
+/// Size of the part of the message RAM that the driver uses, in words.
 pub const MESSAGE_RAM_WORDS: u16 = TX_FIFO + ELEMENT_WORDS * TX_ELEMENTS;
 pub(super) const FILTERS: u16 = MAX_CAN_IDS as u16;
 pub(super) const STANDARD_FILTERS: u16 = 0;
@@ -10,10 +10,10 @@ pub(super) const EXTENDED_FILTERS: u16 = STANDARD_FILTERS + FILTERS;
 pub(super) const RX_ELEMENTS: u16 = 64;
 pub(super) const RX_FIFOS: [u16; 2] =
     [EXTENDED_FILTERS + 2 * FILTERS, EXTENDED_FILTERS + 2 * FILTERS + ELEMENT_WORDS * RX_ELEMENTS];
-/// The frames that a port sends in one cycle.
+/// Capacity of the transmit FIFO: the frames that a port sends in one cycle.
 pub(super) const TX_ELEMENTS: u16 = 32;
 pub(super) const TX_FIFO: u16 = RX_FIFOS[1] + ELEMENT_WORDS * RX_ELEMENTS;
-/// Two header words and 8 bytes of data.
+/// Words of an element: two header words and 8 bytes of data.
 pub(super) const ELEMENT_WORDS: u16 = 4;
 
 const _: () = assert!(MAX_CAN_IDS <= TX_ELEMENTS as usize);
@@ -47,7 +47,7 @@ pub(super) const RX_REGISTERS: [(u8, u8); 2] = [(0xA4, 0xA8), (0xB4, 0xB8)];
 pub(super) const CCCR_INIT: u32 = 1;
 pub(super) const CCCR_CONFIGURE: u32 = 1 << 1;
 pub(super) const CCCR_RESTRICTED: u32 = 1 << 2;
-/// All bits but the three above, clock stop and test mode.
+/// The bits of CCCR to preserve: all but the three above, clock stop and test mode.
 pub(super) const CCCR_KEPT: u32 = 0xF340;
 pub(super) const PSR_PASSIVE: u32 = 1 << 5;
 pub(super) const PSR_WARNING: u32 = 1 << 6;

@@ -60,7 +60,8 @@ impl BitTiming {
             .ok_or(error)
     }
 
-    /// As the register NBTP has it: each less one. The widest jump, for clocks that are off.
+    /// The value of register NBTP, in which each field is one less than its meaning. The jump width is the largest
+    /// possible one, to tolerate inaccurate clocks.
     pub(super) fn register(self) -> u32 {
         let less_one = |value: u16| u32::from(value.saturating_sub(1));
         let jump = less_one(self.behind_sample);
@@ -71,7 +72,7 @@ impl BitTiming {
     }
 }
 
-/// 257 up to the sample point are possible; 7/8 of this many.
+/// Maximum number of quanta per bit: at most 257 are possible up to the sample point, which is at 7/8 of the bit.
 const MAX_QUANTA: u32 = 292;
 
 #[cfg(test)]
