@@ -1,11 +1,11 @@
 //! Counts the instructions of engine passes on a Cortex-M7: `counts IMAGE`, named as a semihosting
 //! argument; IMAGE is the configuration image of `counts.toml` (docs/performance.md section 2).
 //!
-//! `counts IMAGE NAME` runs only this measurement, ten times, for a profile (`firmware/shares.py`). Write blanks of the
-//! name as underscores, because arguments end at a blank.
+//! `counts IMAGE NAME` runs only the measurement with this name, ten times, for a profile (`firmware/shares.py`). Write
+//! blanks in the name as underscores, because an argument ends at a blank.
 //!
 //! With `-icount shift=6` an instruction takes 64 ns of QEMU's time, which is 1.6 ticks of a 25 MHz timer: counts are
-//! exact and reproducible. Each printed line has the mean and maximum of many passes, and their name.
+//! exact and reproducible. Each printed line has the mean and maximum of many passes, and the name of the measurement.
 #![no_std]
 #![no_main]
 
@@ -30,18 +30,18 @@ const UDP: LinkId = LinkId::RECIPE_UDP;
 
 /// Passes per measurement: enough for rare events to count in the mean.
 const PASSES: u32 = 1000;
-/// Passes for a profile, in which each instruction is a line.
+/// Passes for a profile; few, because each instruction of it is a line.
 const PROFILED: u32 = 10;
 /// Time between two passes.
 const STEP: Duration = Duration::from_micros(50);
 const CYCLE: Duration = Duration::from_millis(4);
-/// Period of state packets: fresh enough for frames to the field.
+/// Number of cycles between two state packets: often enough that their values are fresh for frames to the field.
 const STATE_EACH: u32 = 16;
 
 /// Runs one pass and returns its ticks.
 type Measurement = fn(&mut EngineBench) -> u32;
 
-/// Name, ports that send each cycle, pass.
+/// The measurements: name, ports that send each cycle, function of a pass.
 const MEASUREMENTS: [(&str, &[PortId], Measurement); 14] = [
     ("28-byte stream frame to its frame over UDP", &[], EngineBench::sensor_frame),
     ("the same frame in four chunks", &[], |bench| bench.sensor_chunks(7)),
@@ -62,7 +62,7 @@ const MEASUREMENTS: [(&str, &[PortId], Measurement); 14] = [
     ("output cycle of a CAN port, 3 frames", &[DEVICES], |bench| bench.cycle(DEVICES)),
 ];
 
-/// All zeros but the state codes: remote, enabled, stopped, running.
+/// A state packet, all zeros except the state codes: remote, enabled, stopped, running.
 const STATE_PACKET: [u8; 1468] = {
     let mut packet = [0; 1468];
     (packet[1448], packet[1449], packet[1451]) = (2, 6, 5);
@@ -200,7 +200,7 @@ impl EngineBench {
         request
     }
 
-    /// The request is sent and the controller confirms it.
+    /// Reports that the request was sent, and then the controller's confirmation; returns the ticks of both passes.
     fn answer(&mut self) -> [u32; 2] {
         let report = self.pass(Input::LinkSent { link: LinkId::MODBUS });
         let mut answer = [0; 12];
@@ -214,7 +214,7 @@ impl EngineBench {
         self.pass(Input::LinkBytes { link: LinkId::STATE, bytes: &packet })
     }
 
-    /// Segments as TCP delivers them when a window is not a multiple of a packet.
+    /// Ticks of a state packet in segments, as TCP delivers them if a window is not a multiple of a packet.
     fn state_segments(&mut self) -> u32 {
         let packet = black_box(self.packet);
         let ticks =
@@ -262,7 +262,7 @@ impl EngineBench {
     }
 }
 
-/// Like the firmware's gateway; not inlined, so that it is not specialised for an input.
+/// Runs a pass like the firmware's gateway. Not inlined, so that the compiler does not specialise it for an input.
 #[inline(never)]
 fn pass(
     engine: &mut Engine,
@@ -290,15 +290,15 @@ fn pass(
     }
 }
 
-/// Ends the program when instructions are not counted.
+/// Ends the program if the timer does not count instructions.
 fn calibrate() {
-    // Unrolled, so that its length is known: the compiler places constants around it.
+    // Unrolled, so that the number of instructions is known.
     macro_rules! ten_of {
         ($text:expr) => {
             concat!($text, $text, $text, $text, $text, $text, $text, $text, $text, $text)
         };
     }
-    // SAFETY: does nothing, a thousand times.
+    // SAFETY: a thousand NOPs. They access no memory, and change neither registers nor flags.
     let thousand = || unsafe {
         core::arch::asm!(ten_of!(ten_of!(ten_of!("nop\n"))), options(nomem, nostack, preserves_flags))
     };
@@ -309,7 +309,8 @@ fn calibrate() {
     thousand();
     thousand();
     let ticks = timer::since(begin) - once;
-    // 1600, and two jumps more or fewer: the compiler puts constants between so many instructions, and jumps over them.
+    // 1600 ticks, with a tolerance of about two jumps: the compiler places constants between that many instructions,
+    // and jumps over them.
     if !(1596..=1604).contains(&ticks) {
         bare::fail(
             "a thousand instructions",
@@ -327,14 +328,15 @@ mod timer {
 
     pub(super) fn start() {
         for (register, value) in [(RELOAD, u32::MAX), (VALUE, u32::MAX), (CTRL, 1)] {
-            // SAFETY: registers of a timer that nothing else uses; it accesses no memory.
+            // SAFETY: callers pass aligned 32-bit registers of TIMER1, which nothing else uses and which accesses no
+            // memory.
             unsafe { core::ptr::with_exposed_provenance_mut::<u32>(register).write_volatile(value) }
         }
     }
 
     #[inline(always)]
     pub(super) fn ticks() -> u32 {
-        // SAFETY: a register of a timer that nothing else uses; reading it has no effect.
+        // SAFETY: an aligned 32-bit register of TIMER1, which nothing else uses. Reading it has no side effects.
         unsafe { core::ptr::with_exposed_provenance::<u32>(VALUE).read_volatile() }
     }
 

@@ -36,7 +36,7 @@ fn main() -> ! {
     }
 }
 
-/// Buffer size: semihosting calls are slow.
+/// Buffers accesses to the file, because semihosting calls are slow.
 struct Buffered {
     file: File,
     buffer: &'static mut [u8],

@@ -31,7 +31,7 @@ pub(crate) fn with_path<T>(nth: usize, then: impl FnOnce(&CStr) -> T) -> T {
     }
 }
 
-/// Whether there is an `nth` semihosting argument, and this is true of it.
+/// Whether there is an `nth` semihosting argument and `is_true` returns true for it.
 #[allow(dead_code, reason = "not every program has one that may be left out")]
 pub(crate) fn is_argument(nth: usize, is_true: impl FnOnce(&str) -> bool) -> bool {
     let Ok(args) = env::args::<1024>() else { fail("arguments", &"too long") };

@@ -14,7 +14,7 @@ use static_cell::ConstStaticCell;
 
 use crate::any;
 
-/// All zeros: must be placed in .bss, which `.ci/run` checks.
+/// The engine, all zeros: it must be placed in .bss, which `.ci/run` checks.
 static ENGINE: ConstStaticCell<Engine> = ConstStaticCell::new(Engine::idle());
 
 /// An engine with a tap and few exchanges.

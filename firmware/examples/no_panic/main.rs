@@ -1,11 +1,12 @@
-//! The proof that nothing in proto-core, recipe-store, recipe-update, recipe-api or recipe-sparkplug panics: an image
-//! in which every entry of theirs that sees what a device, a peer, a file or flash sent is called with values that the
-//! compiler knows nothing about, and whose panic handler needs a symbol that does not exist. It links only when the
-//! optimiser has removed every panic. With recipe-update, whose signatures are a library's, every call of a panic is
-//! looked at instead. `.ci/run` builds it as the firmware is built, and prints how much stack each of these functions
-//! takes (docs/architecture.md section 4).
+//! Proves that nothing in proto-core, recipe-store, recipe-update, recipe-api or recipe-sparkplug panics.
 //!
-//! It is never run on a board. On a host the same calls are made once, which shows little.
+//! This program calls every function of these crates that processes data of a device, a peer, a file or flash, with
+//! values that are unknown to the compiler. Its panic handler needs a symbol that does not exist, so the program links
+//! only if the optimiser has removed every panic. The signatures of recipe-update come from a library that contains
+//! panics; with it, every call of a panic is checked instead. `.ci/run` builds the program with the options of the
+//! firmware, and prints how much stack each of these functions takes (docs/architecture.md section 4).
+//!
+//! The program is never run on a board. On a host it makes the same calls once, which shows little.
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 mod configuration;
@@ -25,7 +26,7 @@ mod zeros;
 use core::fmt::Write;
 use core::hint::black_box;
 
-/// Bytes of a peer; contents and length are unknown to the compiler.
+/// Bytes whose contents and length are unknown to the compiler, as if sent by a peer.
 fn bytes() -> &'static [u8] {
     static BYTES: [u8; 2048] = [0; 2048];
     black_box(&BYTES[..])

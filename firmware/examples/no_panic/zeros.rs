@@ -1,4 +1,4 @@
-//! Configurations of several sizes as mutable statics that are all zeros and so take no flash. `.ci/run no-panic`
+//! Configurations of several sizes, as mutable statics. They are all zeros, so they take no flash: `.ci/run no-panic`
 //! checks their sections and prints their sizes.
 
 use core::cell::Cell;
@@ -13,7 +13,7 @@ static CONFIG_SMALL: Mutex<Cell<GatewayConfig<1, 1, 32, 0, 4, 0>>> =
 /// Two ports, a route to the controller, the commands of a panel.
 static CONFIG_MEDIUM: Mutex<Cell<GatewayConfig<3, 3, 128, 8, 16, 0>>> =
     Mutex::new(Cell::new(GatewayConfig::empty()));
-/// The maximum that a file can contain.
+/// The largest configuration that a file can contain.
 static CONFIG_FULL: Mutex<Cell<GatewayConfig>> = Mutex::new(Cell::new(GatewayConfig::empty()));
 
 pub(crate) fn all() {
