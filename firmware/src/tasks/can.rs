@@ -1,7 +1,7 @@
 //! A CAN port's task.
 //!
-//! The task receives frames, transmits those of the engine, and restarts the controller after bus-off. It never waits
-//! for one direction only, and yields after a bounded number of events however busy the bus is.
+//! The task receives frames, sends the frames of the engine, and restarts the controller after bus-off. It never waits
+//! for only one direction, and yields after a bounded number of events even if the bus is busy all the time.
 
 use core::pin::pin;
 
@@ -86,7 +86,7 @@ impl<C: CanPort> CanTask<'_, C> {
                     Either3::Second(()) => {}
                     Either3::Third(()) => self.expired(),
                 }
-                // Checked even if the bus is never idle.
+                // Sent here too, because a busy bus may never let the task become idle.
                 self.send_waiting().await;
             }
             self.log_lost();
@@ -132,7 +132,7 @@ impl<C: CanPort> CanTask<'_, C> {
         let mut frames = 0_u32;
         while let Some(frame) = self.control.next_frame() {
             if matches!(self.phase, CanPhase::Off { .. } | CanPhase::Recovering { .. }) {
-                // The engine knows the state of the bus; earlier frames are dropped.
+                // The engine has been told the state of the bus, and earlier frames were dropped.
                 continue;
             }
             frames = frames.saturating_add(1);
@@ -164,7 +164,8 @@ impl<C: CanPort> CanTask<'_, C> {
         }
     }
 
-    /// Frames are not acknowledged: no other node is connected. Waiting frames would be old when one is.
+    /// Drops the frames after a timeout: nobody acknowledges them, so no other node is connected. They would be old by
+    /// the time one is.
     fn give_up(&mut self) {
         // Only the first of consecutive failures is logged.
         if !self.is_failing {
@@ -234,19 +235,19 @@ fn to_core(frame: &impl Frame) -> Option<CanFrame> {
     }
 }
 
-/// Four times the duration of the frames on an idle bus (at most 160 bits each), plus a minimum: frames of other
-/// nodes may have priority.
+/// Time limit for sending `frames` frames: four times their duration on an idle bus (at most 160 bits each), because
+/// frames of other nodes may have priority, plus a minimum.
 fn send_timeout(frames: u32, bitrate: u32) -> Duration {
     let bits = u64::from(frames).saturating_mul(4 * 160);
     Duration::from_micros(bits.saturating_mul(1_000_000) / u64::from(bitrate.max(1))) + SEND_TIMEOUT_MIN
 }
 
-/// Events in a row before the task yields.
+/// Maximum number of events in a row before the task yields.
 const IN_A_ROW: usize = 16;
 const SEND_TIMEOUT_MIN: Duration = Duration::from_millis(250);
 const BACKOFF_MIN: Duration = Duration::from_millis(100);
 const BACKOFF_MAX: Duration = Duration::from_secs(5);
-/// After this time on the bus, the next bus-off has the shortest wait again.
+/// After this time on the bus, the wait after the next bus-off is the shortest one again.
 const HEALTHY: Duration = Duration::from_secs(5);
 /// Limit of a recovery, which takes 129 times 11 bits: 142 ms at 10 kbit/s.
 const RECOVERY: Duration = Duration::from_secs(1);

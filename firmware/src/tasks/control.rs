@@ -13,7 +13,7 @@ use super::notify::Notify;
 /// One transmission: the longest frame or request.
 pub(crate) type Transmission = Vec<u8, OUTPUT_BUFFER>;
 
-/// What waits to be sent on a port. One bus has bytes, another one frames.
+/// Data that waits to be sent on a port: bytes on RS-485, frames on CAN.
 enum PortOutbox {
     Empty,
     Bytes(Transmission),
@@ -38,7 +38,7 @@ impl PortControl {
         }
     }
 
-    /// Sets the CAN ids of the port before its task starts. A configuration has at most as many as fit.
+    /// Sets the CAN ids of the port before its task starts. A configuration cannot have more than fit.
     pub(crate) fn set_ids(&mut self, ids: impl Iterator<Item = CanId>) {
         for id in ids {
             let _ = self.ids.push(id);
@@ -57,7 +57,7 @@ impl PortControl {
         self.changed.notify();
     }
 
-    /// Queues a frame. The engine sends at most as many as fit.
+    /// Queues a frame. The engine never has more frames waiting than fit.
     pub(crate) fn put_frame(&self, frame: CanFrame) {
         let mut outbox = self.outbox.borrow_mut();
         if !matches!(*outbox, PortOutbox::Frames(_)) {
@@ -134,10 +134,10 @@ impl PortControl {
     }
 }
 
-/// The engine's side of a link. A link is open for a *turn*: events of an earlier turn are not
-/// reported, and its data is not sent.
+/// The engine's side of a link. The time from an opening of the link to its closing is a *turn*. Events of an earlier
+/// turn are not reported, and its data is not sent.
 pub(crate) struct LinkControl {
-    /// Odd while the link is to be open; incremented by each opening and closing.
+    /// Number of the turn. Each opening and each closing increments it, so it is odd while the link is to be open.
     turn: Cell<u32>,
     outbox: RefCell<Option<Transmission>>,
     /// Bytes of the transmission in the outbox that the socket has accepted.
@@ -201,13 +201,13 @@ impl LinkControl {
         self.changed.notify();
     }
 
-    /// The number of this turn's bytes that the engine considers unacknowledged.
+    /// Number of bytes of this turn that the engine considers unacknowledged.
     pub(crate) fn unacknowledged(&self) -> u32 {
         self.unacknowledged.get()
     }
 
-    /// `left` is the number of bytes that the socket has accepted, and the peer has not acknowledged. Returns the total
-    /// for the engine if it has changed.
+    /// Updates the number of unacknowledged bytes, and returns it for the engine if it has changed. `left` is the
+    /// number of bytes that the socket has accepted and the peer has not acknowledged.
     pub(crate) fn acknowledged(&self, left: usize) -> Option<u32> {
         let waiting = self.rest(<[u8]>::len).unwrap_or(0);
         let left = left.saturating_add(waiting) as u32;
@@ -251,7 +251,7 @@ impl LinkControl {
         Some(look(outbox.as_ref()?.get(self.sent.get()..).unwrap_or(&[])))
     }
 
-    /// The socket has accepted so many bytes of the transmission; returns whether that was the rest of it.
+    /// Notes that the socket has accepted `count` more bytes of the transmission; returns whether these were the last.
     pub(crate) fn accepted(&self, count: usize) -> bool {
         self.sent.set(self.sent.get().saturating_add(count));
         let is_all = self.rest(<[u8]>::is_empty).unwrap_or(true);
@@ -261,7 +261,7 @@ impl LinkControl {
         is_all
     }
 
-    /// The transmission is in the socket, or dropped.
+    /// Frees the outbox after the transmission was accepted by the socket or dropped.
     pub(crate) fn taken(&self) {
         *self.outbox.borrow_mut() = None;
     }

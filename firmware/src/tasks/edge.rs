@@ -59,7 +59,7 @@ impl NodeMemory {
 pub struct NodeBuffers<'a> {
     rx: &'a mut [u8],
     tx: &'a mut [u8],
-    /// For one piece of output or of input.
+    /// Buffer for one piece of output or input.
     piece: &'a mut [u8],
 }
 

@@ -1,7 +1,7 @@
 //! An Ethernet controller with limited reads.
 //!
-//! The network stack processes all waiting frames before it yields. If they arrived faster than it processes
-//! them, no other task would run any more: no port, no deadline, no watchdog.
+//! The network stack processes all waiting frames before it yields. If frames arrived faster than it processes them, no
+//! other task would run any more: no port would be served, no deadline kept, and the watchdog not fed.
 
 use core::task::Context;
 
@@ -47,7 +47,7 @@ impl<D: Driver> Driver for Fair<'_, D> {
         self.device.transmit(cx)
     }
 
-    /// The stack calls it once in each turn, after reading frames.
+    /// The network stack calls this once in each turn, after reading frames.
     fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
         self.left = FRAMES;
         self.device.link_state(cx)
@@ -62,7 +62,7 @@ impl<D: Driver> Driver for Fair<'_, D> {
     }
 }
 
-/// Frames in a turn: more than a board's receive ring, and about 100 µs of work.
+/// Maximum number of frames in a turn: more than fit into a board's receive ring, and about 100 µs of work.
 const FRAMES: usize = 16;
 
 #[cfg(test)]

@@ -48,15 +48,16 @@ pub struct Gateway {
     ports: Vec<(PortId, PortControl), MAX_FIELD_PORTS>,
     links: Vec<(LinkId, LinkKind, LinkControl), MAX_LINKS>,
     output: RefCell<[u8; OUTPUT_BUFFER]>,
-    /// What a link's task has just received. One for all: it is reported before another task runs.
+    /// Data that a link's task has just received. One buffer for all links suffices, because data is reported before
+    /// another task runs.
     received: RefCell<[u8; INPUT_BUFFER]>,
     deadline: Cell<Instant>,
     deadline_moved: Notify,
     /// A task has yielded before it reported all pending input.
     more_waits: Cell<bool>,
-    /// Sleeps of which the ports' tasks were notified.
+    /// Number of sleeps of which the ports' tasks were notified.
     sleeps: Cell<u32>,
-    /// Safe values are being sent; input from the field is ignored.
+    /// The safe values are being sent; from then on input from field ports is ignored.
     is_ending: Cell<bool>,
 }
 
@@ -79,11 +80,11 @@ impl Gateway {
 
     /// Applies the configuration; ports and links are down.
     pub fn configure(&mut self, config: &GatewayConfig) -> Result<(), BuildError> {
-        // Not in `idle`, which must be all zeros (.bss).
+        // Set here and not in `idle`, whose value must be all zeros (.bss).
         self.deadline.set(Instant::NEVER);
         let engine = self.engine.get_mut();
         engine.configure(config)?;
-        // The vectors are as long as the engine's.
+        // Everything fits: the vectors have the same capacity as those of the engine.
         self.ports.clear();
         self.ports.extend(engine.field_ports().map(|id| (id, PortControl::new())));
         for ((_, control), (.., recipe)) in self.ports.iter_mut().zip(config.view().field_ports()) {
@@ -218,8 +219,8 @@ impl Gateway {
         }
     }
 
-    /// Waits until everything that arrived before now has been reported, so that it does not count as late because
-    /// the processor was busy. The wait is bounded, as a task may always have more.
+    /// Waits until all input that arrived before now has been reported. Otherwise it would count as late only because
+    /// the processor was busy. The wait is bounded, because a task may always have more input.
     ///
     /// In a round of the executor each woken task runs once, in no particular order. Data in the Ethernet controller
     /// reaches the network's task in one round and a link's task in the next.
@@ -237,7 +238,7 @@ impl Gateway {
         }
     }
 
-    /// Notes that a task yields with input that may not have been reported.
+    /// Notes that a task yields although it may have unreported input.
     pub(crate) fn more_waits(&self) {
         self.more_waits.set(true);
     }
@@ -263,8 +264,8 @@ impl Gateway {
 
 /// Polling interval for the safe values.
 const SAFE_CHECK: Duration = Duration::from_millis(5);
-/// One for a task whose interrupt occurs while the time is read, one for the network's task, and one for a link's
-/// task after it.
+/// Number of rounds without input after which all input has been reported: one for a task whose interrupt occurs while
+/// the time is read, one for the network's task, and one for a link's task after it.
 const QUIET_ROUNDS: u8 = 3;
-/// In so many rounds a port's task reports more than any device can buffer.
+/// Limit of rounds. In this many rounds a port's task reports more than any device can buffer.
 const MAX_ROUNDS: u8 = 20;

@@ -1,12 +1,12 @@
 //! One link to the controller or a device: opened, closed and fed as the engine requests.
 //!
-//! A link is one task. It owns its socket, reports received data to the engine and sends what is in its
-//! outbox. It knows no protocol and makes no decision: a link that fails reports this once and waits to be
-//! opened again.
+//! A link is one task. It owns its socket, reports received data to the engine and sends the data in its outbox. It
+//! does not know protocols and makes no decisions: if a link fails, its task reports this once and waits for the engine
+//! to open the link again.
 //!
-//! Sent is not delivered. For a TCP link the engine gets two reports: that the socket has accepted everything, and how
-//! much the peer has not acknowledged. If the engine gives up a link, its connection is closed whatever the task waits
-//! for, and nothing but a reset is sent.
+//! Data that was sent need not have been delivered. For a TCP link the engine gets two reports: that the socket has
+//! accepted everything, and how much the peer has not acknowledged. If the engine gives up a link, its connection is
+//! closed whatever the task waits for, and only a reset is sent.
 
 mod tcp;
 mod udp;
@@ -60,7 +60,7 @@ pub enum Endpoint {
 }
 
 impl Endpoint {
-    /// The remote end of a link. A board has one address, so of `listen` only the port is used.
+    /// The remote end of a link. A board has only one address, so only the port of `listen` is used.
     pub fn of(config: &GatewayConfig, kind: LinkKind) -> Self {
         let controller = &config.controller;
         let host = controller.address.clone();
@@ -98,7 +98,7 @@ pub struct LinkBuffers<'a> {
 }
 
 impl<'a> LinkBuffers<'a> {
-    /// Size of those of all links in bytes: each recipe link may be a connection for frames.
+    /// Size of the buffers of all links in bytes. Each recipe link may be a TCP connection for frames.
     pub const ALL: usize = MAX_UPLINKS * (RX_FRAMES + TX_FRAMES) + (MAX_LINKS - MAX_UPLINKS) * (RX + TX);
 
     /// Takes the buffers from the front of `memory`; `None` if it is too short.
@@ -180,17 +180,18 @@ pub(super) async fn resolve(stack: Stack<'_>, host: &str) -> Option<IpAddress> {
     addresses.first().copied()
 }
 
-/// Receive buffer: a state packet, but a receive window too small for a burst that overruns the Ethernet controller.
+/// Receive buffer: large enough for a state packet. The resulting receive window is too small for a burst that would
+/// overrun the Ethernet controller.
 const RX: usize = INPUT_BUFFER;
-/// Transmit buffer: the engine leaves at most two commands or one transaction unanswered; four of the longest, because
-/// one that is given up may still be unacknowledged.
+/// Transmit buffer: four of the longest commands or transactions. The engine leaves at most two commands or one
+/// transaction unanswered, but one that was given up may still be unacknowledged.
 const TX: usize = 4 * 256;
 /// One datagram, the longest frame.
 const TX_DATAGRAM: usize = OUTPUT_BUFFER;
 /// Receive buffer of a connection for recipe frames: two of the longest.
 const RX_FRAMES: usize = 1024;
-/// Transmit buffer of a connection for recipe frames, so that a controller that acknowledges late does not slow them
-/// down: 64 frames of 72 bytes, as many as the engine sends, or 70 ms of frames of 256 bytes.
+/// Transmit buffer of a connection for recipe frames: 64 frames of 72 bytes, as many as the engine sends, or 70 ms of
+/// frames of 256 bytes. So a controller that acknowledges late does not slow down the frames.
 const TX_FRAMES: usize = 64 * 72;
 const _: () = assert!(TX >= 4 * MAX_COMMAND && TX >= 3 * MAX_ADU);
 const _: () = assert!(RX + TX_DATAGRAM <= RX_FRAMES + TX_FRAMES && RX + TX <= RX_FRAMES + TX_FRAMES);

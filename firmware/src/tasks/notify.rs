@@ -3,7 +3,7 @@
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
 
-/// Stays set until a task waits for it; several notifications count as one.
+/// A notification. It stays set until a task waits for it; several notifications count as one.
 pub(crate) struct Notify(Signal<NoopRawMutex, ()>);
 
 impl Notify {

@@ -46,7 +46,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                     if full_chunks > 0 {
                         gateway.more_waits();
                     }
-                    // Lets other tasks run while the line is never silent.
+                    // Let other tasks run even if the line is never silent.
                     yield_now().await;
                     may_send
                 }
@@ -58,7 +58,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                     continue;
                 }
             };
-            // One copy of it, which no await but that of sending holds.
+            // Taken only here, so that the future holds one copy of the frame, and only while it is sent.
             let Some(frame) = control.take_bytes_if(may_send) else { continue };
             full_chunks = 0;
             task.line.drive(LineDirection::Send);
@@ -83,7 +83,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
         task.report_waiting();
         gateway.input(Input::PortDown { port });
         control.clear();
-        // A line that only does not accept bytes is read without a pause.
+        // If the line only does not accept bytes, it is read again without a pause.
         if failed != ErrorKind::TimedOut {
             Timer::after(RETRY).await;
         }
@@ -114,8 +114,8 @@ impl<L: Line> SerialTask<'_, L> {
         }
     }
 
-    /// Sends a frame, to the end of its last stop bit. If the gateway has slept meanwhile, data in the device is
-    /// old and must be reported before the frame has left.
+    /// Sends a frame and waits for the end of its last stop bit. If the gateway sleeps meanwhile, data in the device is
+    /// old and must be reported even before the frame has left.
     async fn send(&mut self, frame: &[u8]) -> Result<(), ErrorKind> {
         self.control.clear_sleep();
         let mut rest = frame;
@@ -157,7 +157,7 @@ impl LoggedErrors {
     }
 }
 
-/// Twice the duration of the bytes on the line (at most 12 bits each), plus a margin.
+/// Time limit for sending: twice the duration of the bytes on the line (at most 12 bits each), plus a margin.
 fn send_timeout(bytes: usize, baud: u32) -> Duration {
     let bits = (bytes as u64).saturating_mul(24_000_000);
     Duration::from_micros(bits / u64::from(baud.max(1))) + Duration::from_millis(20)
@@ -165,7 +165,7 @@ fn send_timeout(bytes: usize, baud: u32) -> Duration {
 
 /// Bytes per read.
 const CHUNK: usize = 256;
-/// Full chunks in a row: more than any device can buffer.
+/// Number of full chunks in a row after which a frame may be sent: more than any device can buffer.
 const FULL_CHUNKS: usize = 9;
 const ERROR_PERIOD: Duration = Duration::from_secs(1);
 /// Pause after a failure of the device.

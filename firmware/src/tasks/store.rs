@@ -1,8 +1,10 @@
 //! The store task: writes configurations, their marks, the access key and settings.
 //!
 //! In: requests from the console and the edge node, and timeouts of trials. Out: writes to the store, a view for
-//! readers, and the request to restart. `recipe_api::revisions` decides what happens when. Another configuration runs
-//! only after a restart: only the start has the memory to load it, and it counts the attempts.
+//! readers, and the request to restart. Does not know the rules: `recipe_api::revisions` decides what happens when.
+//!
+//! Another configuration runs only after a restart: only the start has the memory to load it, and it counts the
+//! attempts.
 
 mod firmware;
 mod handle;
@@ -242,7 +244,7 @@ impl<F: StoreFlash, S: SlotFlash> StoreTask<'_, F, S> {
 
     fn next_output(&self) -> RevisionOutput {
         let mut revisions = self.handle.revisions.borrow_mut();
-        // Set while the store task runs.
+        // Not `None` here: the revisions are set while the store task runs.
         let Some(revisions) = revisions.as_mut() else {
             return RevisionOutput::Sleep { until: proto_core::time::Instant::NEVER };
         };
@@ -357,7 +359,7 @@ fn revisions_of(store: &Store) -> Option<Revisions> {
     Some(revisions)
 }
 
-/// Stands for no configuration: the base revision of the first configuration of an empty board.
+/// Stands for no configuration. It is the base revision of the first configuration of an empty board.
 pub const NOTHING: Revision = Revision { number: 0, digest: 0 };
 /// Polling interval of a firmware trial.
 const LOOK: Duration = Duration::from_secs(1);

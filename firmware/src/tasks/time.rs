@@ -1,4 +1,4 @@
-//! UTC from a server of SNTP, for the edge node (docs/fleet.md section 6).
+//! UTC from an SNTP server, for the edge node (docs/fleet.md section 6).
 //!
 //! In: datagrams of one server. Out: UTC. `recipe_sparkplug::sntp` decides which datagrams are accepted and when the
 //! server is queried. The engine does not use UTC.
@@ -58,7 +58,7 @@ pub async fn run(
         let until = Instant::from_micros(sntp.deadline().as_micros());
         pulse.idle(pin!(Timer::at(until))).await;
         pulse.idle(pin!(stack.wait_config_up())).await;
-        // Taken before the request is built, to measure the round trip.
+        // Resolve first: the request contains the time, from which the round trip is measured.
         let address = pulse.idle(pin!(resolve(stack, host))).await;
         let Some(request) = sntp.poll(now()) else { continue };
         let Some(address) = address else {

@@ -1,9 +1,9 @@
 //! Checks that every task still runs; the watchdog is fed only then.
 //!
-//! A task may wait forever for a byte, so it has a [`Pulse`]: it waits for what may never come through [`Pulse::idle`],
-//! which answers the check. A task that hangs anywhere else does not answer, is named in the log, and the watchdog is
-//! not fed. A task that never yields keeps the feeder from running, with the same effect; an interrupt gets its name
-//! from [`running`].
+//! Each task has a [`Pulse`]. A wait that may never end, such as for a byte, goes through [`Pulse::idle`], which
+//! answers the checks meanwhile. A task that hangs anywhere else does not answer: it is named in the log, and the
+//! watchdog is not fed. A task that never yields keeps the feeder from running, with the same effect; an interrupt can
+//! then get the name of the task from [`running`].
 
 use core::cell::{Cell, RefCell};
 use core::fmt;
@@ -146,7 +146,7 @@ pub fn running() -> Option<TaskName> {
 pub struct Pulse {
     name: Cell<Option<TaskName>>,
     has_answered: Cell<bool>,
-    /// It was named in the log and has not answered since.
+    /// The task was named in the log and has not answered since.
     is_suspect: Cell<bool>,
     waker: RefCell<WakerRegistration>,
 }
@@ -161,9 +161,9 @@ impl Pulse {
         }
     }
 
-    /// Waits for something that may never come, and answers checks meanwhile.
+    /// Waits for something that may never happen, and answers checks meanwhile.
     ///
-    /// A wait that ends by itself within a quarter of the watchdog's period does not need it.
+    /// A wait that always ends within a quarter of the watchdog's period need not use this.
     pub async fn idle<F: Future>(&self, mut wait: Pin<&mut F>) -> F::Output {
         poll_fn(|cx| {
             self.has_answered.set(true);
@@ -173,11 +173,11 @@ impl Pulse {
         .await
     }
 
-    /// Runs the whole task, so that [`running`] knows it.
+    /// Polls the whole task, and makes it known to [`running`] meanwhile.
     pub async fn run<F: Future>(&self, mut task: Pin<&mut F>) -> F::Output {
         let code = self.name.get().map_or(0, TaskName::code);
         poll_fn(|cx| {
-            // It may have interrupted a task of another executor.
+            // Restored afterwards, because this task may have interrupted a task of another executor.
             let before = RUNNING.swap(code, Ordering::Relaxed);
             let result = task.as_mut().poll(cx);
             RUNNING.store(before, Ordering::Relaxed);
@@ -212,8 +212,8 @@ impl<const N: usize> TaskWatch<N> {
         Some(pulse)
     }
 
-    /// Whether all have responded since the last round; then they are asked again. Each missing
-    /// response is logged once, and once more when it comes.
+    /// Returns whether all tasks have answered since the last round; if so, begins a new round of checks. Each missing
+    /// answer is logged once, and once more when it arrives.
     fn round(&self, mut tell: impl FnMut(TaskName, PulseFault)) -> bool {
         let registered = || self.pulses.iter().take(self.count.get());
         for pulse in registered() {

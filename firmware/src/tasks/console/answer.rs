@@ -24,8 +24,8 @@ pub(super) enum SendError {
     TooLong,
 }
 
-/// A reply whose body is in the buffer of its connection. It is built without awaiting and sent in one place: each
-/// await point costs flash.
+/// A reply whose body is in the buffer of its connection. It is built without awaiting and sent in one place, because
+/// each await point costs flash.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reply {
     status: StatusCode,
@@ -120,7 +120,7 @@ impl Responder<'_, '_> {
 
     pub(super) async fn answer(&mut self, reply: &Reply) -> Result<(), SendError> {
         let body = reply.len.ok_or(SendError::TooLong)?;
-        // Behind the body in the buffer, because it contains the body's length.
+        // The head is written behind the body, because it contains the body's length.
         let head = self.write_head(body, Length::Bytes(body as u64), reply).ok_or(SendError::TooLong)?;
         let until = Instant::now() + MAX_TIME;
         self.send_part(body, body.saturating_add(head), until).await?;

@@ -23,11 +23,12 @@ pub(super) struct ConsoleRequest<'a> {
     pub(super) peer: Ipv4Addr,
 }
 
-/// What a head says beside the operation. It is parsed at once, so that the memory of the head is free for the reply.
+/// The arguments in the head of a request. They are all parsed at once, so that the buffer with the head is free for
+/// the reply.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct HeadArguments {
     pub(super) method: Method,
-    /// `revision`, `lines` or `offset`, of which an operation has one; `Some(None)`: no number.
+    /// `revision`, `lines` or `offset`; an operation has at most one of them. `Some(None)`: not a number.
     pub(super) number: Option<Option<u32>>,
     /// `downgrade` or `restart`; `Some(false)`: not `yes`.
     pub(super) yes: Option<bool>,

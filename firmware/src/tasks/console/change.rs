@@ -47,7 +47,7 @@ impl Console {
                 self.is_claimed(None);
                 Reply::error(buf, StatusCode::INTERNAL, "the key cannot be kept")
             }
-            // Not logged: an update has many pieces.
+            // Pieces are not logged, because an update has many.
             (Ok(_), StoreRequest::Piece { .. }) => self.firmware(buf, StatusCode::OK),
             (Ok(_), StoreRequest::ConfirmFirmware) => {
                 warn!("the firmware is confirmed for {}", DisplayText(&peer));
@@ -142,8 +142,8 @@ impl Console {
         request: &ConsoleRequest<'_>,
     ) -> Result<(StoreRequest, StoreLock<'_>), Reply> {
         let Some(store) = self.store else { return Err(nothing_kept(buf)) };
-        // Before the claim begins, which would otherwise have to be finished. While the store is being read no key is
-        // accepted.
+        // Take the lock before the claim begins, because a claim that has begun must be finished. No key is accepted
+        // while the store is being read.
         let Some(lock) = store.take().filter(|_| store.look(|_| ()).is_some()) else {
             return Err(busy(buf));
         };

@@ -57,7 +57,7 @@ impl Console {
                 }
                 // Catches peers that lost power. Longest of all timeouts, so that the others take effect first.
                 socket.set_timeout(Some(SILENT));
-                // No limit: the number of tasks is the limit.
+                // No limit is needed here, because the number of tasks limits the connections.
                 let _one = ConnectionPermit::of(&self.connections, usize::MAX);
                 self.count(|counters| &mut counters.connections);
                 match self.connection(&mut socket, buf).await {
@@ -113,8 +113,8 @@ impl Console {
         responder.answer(&reply).await
     }
 
-    /// Waits for the head, in the buffer of the reply. Returns what comes of it, and where the beginning of the body is
-    /// in the buffer; `None` on timeout.
+    /// Receives the head of a request into the buffer of the reply. Returns the result of admitting the request, and
+    /// the part of the buffer with the beginning of the body; `None` on timeout.
     async fn receive_head(
         &self,
         responder: &mut Responder<'_, '_>,
@@ -166,7 +166,7 @@ impl Console {
         Ok(Decided { admitted, arguments, peer })
     }
 
-    /// Prepares what an admitted request needs, or the reply to another one.
+    /// Prepares an admitted request, or the reply to one that is not admitted.
     #[inline(never)]
     fn admit(
         &self,
@@ -209,7 +209,7 @@ impl Console {
     ) -> Result<BodyRead, SendError> {
         let length = usize::try_from(admitted.length).unwrap_or(0);
         let mut hash = BodyHash::new();
-        // Bytes behind the body are another request, which is ignored.
+        // Bytes behind the body belong to another request, which is ignored.
         let mut piece = rest.len().min(length);
         responder.buf.copy_within(rest.start..rest.start.saturating_add(piece), 0);
         if admitted.expects_continue && piece < length {
@@ -260,7 +260,7 @@ struct Decided {
 
 enum BodyRead {
     Whole,
-    /// Its hash differs from the signed one.
+    /// The hash of the body differs from the signed one.
     Other,
     /// It did not arrive in time.
     Incomplete,
@@ -276,8 +276,8 @@ fn address(address: IpAddress) -> Ipv4Addr {
 const RX: usize = 1024;
 /// Transmit buffer: unacknowledged data at a long round trip.
 const TX: usize = 1536;
-/// Buffer of a connection: the longest piece of a reply, or its head and a short body. Before that, the head of the
-/// request and what is read of it at once.
+/// Buffer of a connection: for the longest piece of a reply, or for the head and a short body. Before the reply it
+/// contains the head of the request and the bytes of one more read.
 const BUFFER: usize = 3328;
 const _: () = assert!(BUFFER >= MAX_HEAD + CHUNK);
 /// Bytes per read; each chunk of an image is hashed in one go.

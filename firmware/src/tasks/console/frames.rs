@@ -13,14 +13,14 @@ use super::answer::TextBuffer;
 /// The only reader of the frame tap; released on drop.
 pub(super) struct Follower<'c> {
     console: &'c Console,
-    /// Restricts the frames to this port, or to none.
+    /// Restricts the frames to this port; `Some(None)`: there is no such port, and so no frames.
     port: Option<Option<PortId>>,
     /// Records dropped because the queue was full, not yet reported.
     lost: u32,
 }
 
 impl Console {
-    /// Starts reading the tap; `None` if there is a reader already, because there is one ring.
+    /// Starts reading the tap. Returns `None` if it has a reader already: its ring buffer serves only one.
     pub(super) fn follow(&self, port: Option<Option<PortId>>) -> Option<Follower<'_>> {
         if self.is_followed.replace(true) {
             return None;
@@ -64,7 +64,7 @@ impl Follower<'_> {
     }
 }
 
-/// The keys of the host's events except decoded values.
+/// Writes a frame with the same keys as the host's events, except decoded values.
 fn write(out: &mut TextBuffer<'_>, record: &TapRecord<'_>, port: &str) -> fmt::Result {
     write!(out, "{{\"time_us\":{},\"port\":", record.at.as_micros())?;
     json::write_text(out, port)?;

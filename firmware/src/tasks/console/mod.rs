@@ -1,10 +1,11 @@
 //! The console: the API of docs/api.md over HTTP.
 //!
-//! In: connections, a button. Out: replies, and requests to the store task. Access control is in `recipe_api`; flash is
-//! unknown here. There are [`CONNECTIONS`] tasks; each serves one request per connection. Documents are written in
-//! pieces: a task borrows the engine, writes at most a port or 32 variables into its buffer, and yields before it sends
-//! the piece. So the engine never waits for a socket, and the parts of a document may be of slightly different
-//! instants.
+//! In: connections, a button. Out: replies, and requests to the store task. Does not know flash; access control is in
+//! `recipe_api`.
+//!
+//! There are [`CONNECTIONS`] tasks; each serves one request per connection. Documents are written in pieces: a task
+//! borrows the engine, writes at most a port or 32 variables into its buffer, and yields before it sends the piece. So
+//! the engine never waits for a socket, but the parts of a document may describe slightly different instants.
 
 mod answer;
 mod arguments;
@@ -85,7 +86,7 @@ struct ConnectionCounters {
     slow_readers: u32,
     /// Events skipped because their client reads slowly.
     lost_events: u32,
-    /// Replies that did not fit into the buffer and were cut off.
+    /// Replies that were truncated because they did not fit into the buffer.
     cut_off: u32,
 }
 
@@ -157,7 +158,7 @@ impl Console {
 struct ConnectionPermit<'a>(&'a Cell<usize>);
 
 impl<'a> ConnectionPermit<'a> {
-    /// `None` if there are `most` already.
+    /// Counts one more; `None` if there are `most` already.
     fn of(count: &'a Cell<usize>, most: usize) -> Option<Self> {
         (count.get() < most).then(|| {
             count.set(count.get().saturating_add(1));

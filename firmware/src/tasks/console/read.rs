@@ -274,7 +274,7 @@ fn write_json(out: &mut TextBuffer<'_>, value: &impl Serialize) -> fmt::Result {
 
 pub(super) const PAGE: Page =
     Page { bytes: &recipe_console::PAGE, policy: recipe_console::POLICY, etag: recipe_console::ETAG };
-/// Bytes of it per write.
+/// Bytes of the web page per write.
 const PAGE_PIECE: usize = 1024;
 const MAX_LINES: u32 = 256;
 const LOG_PIECE: usize = 1024;

@@ -1,6 +1,6 @@
 //! Server-sent events: state and values five times a second, and frames for a client that asks for them.
 //!
-//! A slow client gets fewer events, with the number of lost ones; a client that does not read is dropped.
+//! A slow client gets fewer events, with the number of those it missed. A client that does not read is disconnected.
 
 use core::fmt::Write;
 
@@ -105,5 +105,5 @@ impl Console {
 
 /// Time between two events.
 const PERIOD: Duration = Duration::from_millis(200);
-/// Polling interval of the tap, whose ring holds little more.
+/// Polling interval of the tap. At full load, its ring buffer holds the frames of little more than this time.
 const FRAMES: Duration = Duration::from_millis(20);

@@ -43,8 +43,8 @@ impl LinkDriver<'_> {
                 let _ = with_timeout(CLOSE_TIMEOUT, closing).await;
             }
         }
-        // Unacknowledged data must not be delivered after newer values: from here on only the reset is sent,
-        // which also ends the peer's connection.
+        // Unacknowledged data must not be delivered after newer values. So from here on only a reset is sent, which
+        // also ends the connection on the peer's side.
         socket.abort();
         let _ = with_timeout(CLOSE_TIMEOUT, socket.flush()).await;
     }
@@ -60,7 +60,7 @@ impl LinkDriver<'_> {
             }
             match socket.remote_endpoint() {
                 Some(peer) if peer.addr == controller && socket.may_send() => {
-                    // A controller that was switched off has to find the socket free again.
+                    // Keep-alives detect that the controller was switched off, so that it finds the socket free again.
                     socket.set_keep_alive(Some(KEEP_ALIVE_PERIOD));
                     socket.set_timeout(Some(KEEP_ALIVE_TIMEOUT));
                     return true;
@@ -77,7 +77,7 @@ impl LinkDriver<'_> {
     async fn exchange(&self, turn: u32, socket: &mut TcpSocket<'_>) {
         let (reader, writer) = socket.split();
         let writer = RefCell::new(writer);
-        // Reading is polled first, because after an error the acknowledgements are unknown.
+        // Reading is polled first, because acknowledgements cannot be read any more after an error.
         let reading = self.read(turn, reader, &writer);
         let writing = self.write(turn, &writer);
         let looking = self.watch_acknowledgements(turn, &writer);
@@ -122,7 +122,7 @@ impl LinkDriver<'_> {
     /// Reports acknowledgements to the engine while something is unacknowledged.
     async fn watch_acknowledgements(&self, turn: u32, writer: &RefCell<TcpWriter<'_>>) {
         loop {
-            // Needs no waker: data from the engine wakes this task.
+            // No waker is registered, because data from the engine wakes this task anyway.
             poll_fn(|_| if self.control.unacknowledged() > 0 { Poll::Ready(()) } else { Poll::Pending })
                 .await;
             Timer::after(ACK_PERIOD).await;

@@ -56,8 +56,8 @@ impl LinkDriver<'_> {
             };
             match after {
                 SocketEnd::End => return,
-                // The peer is not found on the network. The waiting datagram would be sent when it comes back,
-                // however old it is then.
+                // The peer is not found on the network. Drop the waiting datagram: it would be sent when the peer comes
+                // back, however old it is then.
                 SocketEnd::Reopen => {
                     socket.close();
                     if socket.bind(own).is_err() || !self.report(turn, Input::LinkSent { link: self.link }) {
@@ -147,5 +147,5 @@ enum SocketEnd {
 
 /// Datagrams in the receive buffer.
 const DATAGRAMS: usize = 8;
-/// Maximum age of a datagram when it leaves: that of a frame on TCP when it is delivered.
+/// Maximum age of a datagram when it is sent: the same as that of a frame on TCP when it is delivered.
 const SEND_TIMEOUT: Duration = Duration::from_millis(250);

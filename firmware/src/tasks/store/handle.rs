@@ -1,4 +1,4 @@
-//! Request queue of the store task, for the console and the edge node; they wait here for the result.
+//! The request queue of the store task. Console and edge node send requests through it and wait for the results.
 
 use core::cell::{Cell, RefCell};
 
@@ -120,7 +120,7 @@ pub struct StoreHandle {
     /// The lock is taken; there is one change at a time.
     pub(super) is_taken: Cell<bool>,
     pub(super) image: RefCell<&'static mut [u8; MAX_IMAGE]>,
-    /// How far the image was validated. One for all connections: only who holds the lock has an image.
+    /// How far the image was validated. One for all connections, because only the holder of the lock has an image.
     scan: RefCell<Scan>,
     pub(super) requests: Signal<NoopRawMutex, StoreRequest>,
     pub(super) done: Signal<NoopRawMutex, Result<u32, Failed>>,
