@@ -45,7 +45,6 @@ impl<const N: usize> Tasks<N> {
         Self { spawner, watch }
     }
 
-    /// The pulses of the tasks.
     pub(crate) const fn watch(&self) -> &'static TaskWatch<N> {
         self.watch
     }

@@ -120,7 +120,6 @@ impl PortControl {
         }
     }
 
-    /// The next frame to send, if there is one.
     pub(crate) fn next_frame(&self) -> Option<CanFrame> {
         match &mut *self.outbox.borrow_mut() {
             PortOutbox::Frames(frames) => frames.pop_front(),

@@ -58,7 +58,7 @@ pub async fn run(gateway: &Gateway, pulse: &Pulse, port: PortId, line: impl Line
                     continue;
                 }
             };
-            // Taken only here, so that the future holds one copy of the frame, and only while it is sent.
+            // The future holds only this copy of the frame, and no await except that of sending holds it.
             let Some(frame) = control.take_bytes_if(may_send) else { continue };
             full_chunks = 0;
             task.line.drive(LineDirection::Send);

@@ -61,7 +61,6 @@ impl RecordKey {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RecordHead {
-    /// Code of the key.
     pub(crate) key: u8,
     /// Sequence number: higher than those of all records written before. A copy of a record keeps its number.
     pub(crate) sequence: u32,

@@ -72,7 +72,7 @@ impl platform::Board for Mps2An500 {
         flash::slots()
     }
 
-    /// The operations of a file on the host complete at once, so no time limit or feeding is needed.
+    /// The operations of a file on the host complete at once, so the watchdog need not be fed.
     fn block_on<T>(&mut self, operation: impl Future<Output = T>) -> T {
         embassy_futures::block_on(operation)
     }
@@ -178,7 +178,6 @@ unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
     end(102)
 }
 
-/// The LAN9118's registers.
 #[derive(Debug)]
 pub(crate) struct LanRegisters;
 
@@ -204,7 +203,6 @@ fn on_lan9118() {
     Lan9118::interrupt(&LanRegisters, &LAN_WAKER);
 }
 
-/// The number of an interrupt.
 #[derive(Debug, Clone, Copy)]
 struct Irq(u16);
 

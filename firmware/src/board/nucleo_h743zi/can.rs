@@ -43,7 +43,6 @@ const _: () = assert!(MESSAGE_RAM_WORDS <= 2_560);
 
 static WAKER: AtomicWaker = AtomicWaker::new();
 
-/// FDCAN1's interrupt.
 pub(super) struct CanInterrupt;
 
 impl Handler<typelevel::FDCAN1_IT0> for CanInterrupt {

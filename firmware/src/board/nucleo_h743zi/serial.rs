@@ -8,7 +8,6 @@ use embassy_stm32::{Peri, peripherals, rcc};
 use firmware::drivers::usart::{BaudError, Usart, UsartBlock, UsartShared};
 use proto_core::config::Rs485;
 
-/// An RS-485 line.
 pub(crate) type SerialDevice = Usart<UsartRegisters>;
 
 #[derive(Clone, Copy)]
@@ -31,9 +30,7 @@ impl UsartBlock for UsartRegisters {
 static USART2_STATE: UsartShared = UsartShared::new();
 static UART7_STATE: UsartShared = UsartShared::new();
 
-/// USART2's interrupt.
 pub(super) struct Usart2Interrupt;
-/// UART7's interrupt.
 pub(super) struct Uart7Interrupt;
 
 impl Handler<typelevel::USART2> for Usart2Interrupt {

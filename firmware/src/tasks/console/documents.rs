@@ -66,7 +66,6 @@ impl Console {
         Ok(is_more.then_some(buf.len))
     }
 
-    /// Whether no configuration runs.
     pub(super) fn is_idle(&self) -> bool {
         self.gateway.report(|status| status.health()) == Health::Idle
     }

@@ -103,7 +103,6 @@ impl Console {
     }
 }
 
-/// Time between two events.
 const PERIOD: Duration = Duration::from_millis(200);
 /// Polling interval of the tap. At full load, its ring buffer holds the frames of little more than this time.
 const FRAMES: Duration = Duration::from_millis(20);
