@@ -1,4 +1,4 @@
-//! Addresses in `Host`. The library's reader has panics that the optimiser does not remove.
+//! IP addresses in `Host`, parsed here because the parser of `core` has panics that the optimiser does not remove.
 
 use core::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 
@@ -6,7 +6,7 @@ use heapless::Vec;
 
 use crate::request::cut;
 
-/// The address that a text is: four numbers, or groups of hexadecimal digits without brackets.
+/// Parses an IP address: four decimal numbers, or hexadecimal groups without brackets.
 pub(crate) fn parse(text: &str) -> Option<IpAddr> {
     match text.bytes().any(|byte| byte == b':') {
         true => v6(text).map(IpAddr::V6),
@@ -20,7 +20,7 @@ fn v4(text: &str) -> Option<Ipv4Addr> {
     for octet in &mut octets {
         let (part, behind) = part(rest?, b'.');
         rest = behind;
-        // A zero in front could be an octal number to others.
+        // Other programs could read a leading zero as octal.
         let is_number = part.len() == 1 || !part.starts_with('0');
         if !is_number || part.is_empty() || !part.bytes().all(|byte| byte.is_ascii_digit()) {
             return None;
@@ -50,7 +50,7 @@ fn v6(text: &str) -> Option<Ipv6Addr> {
     Some(segments.into())
 }
 
-/// Groups with colons between them; none in an empty text.
+/// Groups separated by colons; an empty text has none.
 fn groups(text: &str) -> Option<Vec<u16, 8>> {
     let mut groups = Vec::new();
     let mut rest = (!text.is_empty()).then_some(text);
@@ -65,7 +65,7 @@ fn groups(text: &str) -> Option<Vec<u16, 8>> {
     Some(groups)
 }
 
-/// What is before the first `at`, and what is behind it if it is there.
+/// What comes before the first `at`, and what comes after it; `None` without an `at`.
 fn part(text: &str, at: u8) -> (&str, Option<&str>) {
     cut(text, at).map_or((text, None), |(part, behind)| (part, Some(behind)))
 }

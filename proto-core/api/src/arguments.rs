@@ -1,14 +1,15 @@
-//! The arguments of an operation: an object of JSON with numbers and texts, one level deep.
+//! The arguments of an operation: a flat JSON object of numbers and strings.
 //!
-//! In: a body. Out: its entries. Takes less than JSON: no nesting, no escapes, and numbers without a sign or an
-//! exponent, in thousandths. For a board, where a whole reader would be as long as all operations together.
+//! In: a body. Out: its entries. Accepts a subset of JSON: no nesting, no escapes, and numbers without a sign or an
+//! exponent, in thousandths. Made for a board, where a complete JSON parser would be as large as all operations
+//! together.
 
 use crate::request::{cut, trim};
 
 /// The value of an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ArgumentValue<'a> {
-    /// A number, in thousandths; further digits are cut off.
+    /// A number in thousandths; further digits are cut off.
     Thousandths(u64),
     /// A text.
     Text(&'a str),
@@ -26,8 +27,8 @@ impl ArgumentValue<'_> {
     }
 }
 
-/// Calls `found` with each entry; a body without a byte has none. `false` if it is no such object, or if `found`
-/// refuses an entry.
+/// Calls `found` with each entry; an empty body has none. Returns `false` if the body is not such an object, or if
+/// `found` refuses an entry.
 pub fn each<'a>(body: &'a [u8], mut found: impl FnMut(&'a str, ArgumentValue<'a>) -> bool) -> bool {
     let Ok(text) = core::str::from_utf8(body) else { return false };
     let text = blank_free(text);
@@ -45,7 +46,7 @@ pub fn each<'a>(body: &'a [u8], mut found: impl FnMut(&'a str, ArgumentValue<'a>
         }
         rest = match blank_free(behind) {
             "" => return true,
-            // Behind a comma there is another entry.
+            // A comma must be followed by another entry.
             behind => match behind.strip_prefix(',').map(blank_free) {
                 Some(next) if !next.is_empty() => next,
                 _ => return false,
@@ -62,7 +63,7 @@ fn value(text: &str) -> Option<(ArgumentValue<'_>, &str)> {
     let end = text.bytes().position(|byte| !byte.is_ascii_digit() && byte != b'.').unwrap_or(text.len());
     let (number, behind) = text.split_at_checked(end)?;
     let (whole, fraction) = cut(number, b'.').unwrap_or((number, "0"));
-    // A zero in front is no JSON.
+    // JSON does not allow a leading zero.
     let is_number = (whole == "0" || !whole.starts_with('0'))
         && [whole, fraction]
             .iter()
@@ -77,7 +78,7 @@ fn value(text: &str) -> Option<(ArgumentValue<'_>, &str)> {
     Some((ArgumentValue::Thousandths(thousandths), behind))
 }
 
-/// The text in quotes at the front, and what is behind it.
+/// The quoted text at the front, and what follows it.
 fn quoted(text: &str) -> Option<(&str, &str)> {
     let (inside, behind) = cut(text.strip_prefix('"')?, b'"')?;
     let is_plain = !inside.bytes().any(|byte| byte == b'\\' || byte < b' ');
@@ -92,7 +93,7 @@ fn blank_free(text: &str) -> &str {
     text
 }
 
-/// As many as a 32-bit number has.
+/// The number of decimal digits of `u32::MAX`.
 const MAX_DIGITS: usize = 10;
 
 #[cfg(test)]
@@ -164,7 +165,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever it takes, another reader takes too, and reads the same.
+        /// Whatever this parser accepts, serde_json accepts too, and reads the same.
         #[test]
         fn it_is_json(body in r#"\{(("[ab]":([0-9]{1,3}(\.[0-9]{1,4})?|"[a-z{}:, ]{0,3}"))[, ]{0,2}){0,3}\}"#) {
             if let Some(entries) = read(&body) {
@@ -173,7 +174,7 @@ mod tests {
                 })?;
                 for (key, value) in entries {
                     match value {
-                        // Of two with one name the other reader keeps the last.
+                        // If a name occurs twice, the other parser keeps the last.
                         ArgumentValue::Text(_) => prop_assert!(other.get(key).is_some()),
                         ArgumentValue::Thousandths(_) => prop_assert!(other.get(key).is_some()),
                     }

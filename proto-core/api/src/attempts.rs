@@ -1,18 +1,18 @@
-//! Wrong keys: after five within a minute an address has to wait.
+//! Wrong keys: an address with five of them within a minute has to wait.
 //!
-//! A key of 128 bits cannot be guessed at any rate; the limit keeps logs short and shows whoever tries. It is
-//! per address, so that one computer of the cell cannot lock out another.
+//! A key of 128 bits cannot be guessed at any rate. The limit keeps logs short and shows who tries. It counts per
+//! address, so one computer of the cell cannot lock out another.
 
 use core::net::IpAddr;
 
 use heapless::Vec;
 use proto_core::time::{Duration, Instant};
 
-/// Number of wrong keys that an address has.
+/// Number of wrong keys after which an address has to wait.
 pub const MAX_WRONG: usize = 5;
-/// Within this time.
+/// The time within which wrong keys are counted.
 pub const WINDOW: Duration = Duration::from_secs(60);
-/// Number of addresses that are remembered; the one that was silent the longest is forgotten.
+/// Number of addresses that are remembered. Of more, the one without a wrong key for the longest time is forgotten.
 const MAX_ADDRESSES: usize = 16;
 
 /// Who sent wrong keys, and when.
@@ -28,7 +28,7 @@ struct Address {
 }
 
 impl Attempts {
-    /// Without one.
+    /// No wrong keys yet.
     pub const fn new() -> Self {
         Self { addresses: Vec::new() }
     }
@@ -47,7 +47,7 @@ impl Attempts {
         }
         self.addresses.retain(|known| !known.wrong.is_empty());
         if let Some(known) = self.addresses.iter_mut().find(|known| known.at == address) {
-            // When it is full the address has to wait, and is not looked at.
+            // Never full here: an address with this many has to wait, and its requests are not checked.
             let _ = known.wrong.push(now);
             return;
         }
@@ -55,7 +55,7 @@ impl Attempts {
         if self.addresses.is_full() {
             let oldest = self.addresses.iter().map(newest).min();
             let mut is_gone = false;
-            // One of them, if several are as old.
+            // Any of them, if several are equally old.
             self.addresses
                 .retain(|known| Some(newest(known)) != oldest || core::mem::replace(&mut is_gone, true));
         }
@@ -86,7 +86,7 @@ mod tests {
         assert_eq!(attempts.must_wait(at(40), HERE), Some(Duration::from_secs(20)));
         assert_eq!(attempts.must_wait(at(40), IpAddr::V4(Ipv4Addr::new(10, 0, 0, 1))), None);
         assert_eq!(attempts.must_wait(at(59), HERE), Some(Duration::from_secs(1)));
-        // The first one is a minute old: there is one more.
+        // The oldest wrong key is a minute old, so one more attempt is allowed.
         assert_eq!(attempts.must_wait(at(60), HERE), None);
         attempts.was_wrong(at(60), HERE);
         assert_eq!(attempts.must_wait(at(60), HERE), Some(Duration::from_secs(10)));

@@ -1,33 +1,33 @@
 //! Who may give a board its key: whoever presses its button first.
 //!
-//! In: the button, a claim, the end of writing the key. Out: whether a claim is taken. A board without a key
-//! works, and takes one only within [`WINDOW`] of a press. Knows neither the button nor where keys are kept.
+//! In: presses of the button, claims, the result of writing the key. Out: whether a claim is accepted. A board without
+//! a key works, but accepts one only within [`WINDOW`] of a press. Does not know the button, or where keys are stored.
 
 use proto_core::time::{Duration, Instant};
 
-/// How long a press lets the board take a key.
+/// How long after a press the board accepts a key.
 pub const WINDOW: Duration = Duration::from_secs(60);
 
 /// Whether there is a key, or may be one soon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Claim {
-    /// There is none, and none is taken.
+    /// There is no key, and none is accepted.
     Unclaimed,
-    /// There is none, and one is taken until then.
+    /// There is no key, and one is accepted until the end of the window.
     Open {
         /// The end of the window.
         until: Instant,
     },
-    /// One was taken and is being written; until then the board has none.
+    /// A key was accepted and is being written. Until it is written, the board has none.
     Writing {
-        /// The end of the window, for another try if it cannot be written.
+        /// The end of the window, for another attempt if the key cannot be written.
         until: Instant,
     },
-    /// There is one.
+    /// There is a key.
     Claimed,
 }
 
-/// Why a key is not taken.
+/// Why a key is not accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ClaimError {
     /// The button was not pressed within the last minute.
@@ -44,14 +44,14 @@ impl Claim {
         if has_key { Self::Claimed } else { Self::Unclaimed }
     }
 
-    /// The button was pressed. A press while the window is open makes it last anew.
+    /// The button was pressed. A press while the window is open restarts the window.
     pub fn pressed(&mut self, now: Instant) {
         if let Self::Unclaimed | Self::Open { .. } = self {
             *self = Self::Open { until: now + WINDOW };
         }
     }
 
-    /// Somebody offers a key. If it is taken, the driver writes it and then calls [`Claim::written`].
+    /// A client offers a key. If it is accepted, the driver writes it and then calls [`Claim::written`].
     pub fn offered(&mut self, now: Instant) -> Result<(), ClaimError> {
         self.poll(now);
         match *self {
@@ -65,7 +65,7 @@ impl Claim {
         }
     }
 
-    /// The key that was taken is written, or could not be.
+    /// The accepted key was written, or could not be.
     pub fn written(&mut self, now: Instant, is_written: bool) {
         if let Self::Writing { until } = *self {
             *self = if is_written { Self::Claimed } else { Self::Open { until } };
@@ -121,7 +121,7 @@ mod tests {
         let mut claim = Claim::at_start(false);
         claim.pressed(at(0));
         claim.offered(at(1)).unwrap();
-        // A press in between opens nothing longer.
+        // A press meanwhile does not extend the window.
         claim.pressed(at(2));
         claim.written(at(3), false);
         assert_eq!(claim, Claim::Open { until: at(60) });

@@ -1,8 +1,8 @@
 //! The documents `status` and `values` of a gateway, as JSON in pieces.
 //!
-//! In: a [`Status`] for each piece. Out: text. A piece is at most one port or one of its peers, a link or histogram, or
-//! [`VALUES_AT_ONCE`] variables, so that a driver with little memory sends one before it makes the next. Each
-//! piece may be of a later instant than the one before; the document is well-formed all the same. Unknown
+//! In: a [`Status`] for each piece. Out: text. A piece is at most one port or one of its peers, one link, one
+//! histogram, or [`VALUES_AT_ONCE`] variables, so a driver with little memory can send each piece before it makes the
+//! next. Each piece may show a later instant than the one before; the document is well-formed all the same. Unknown
 //! values are absent.
 
 use core::fmt::{self, Write};
@@ -36,7 +36,7 @@ pub struct Pieces {
 enum DocumentStep {
     Status,
     Port(usize),
-    /// Of a port, by their places.
+    /// A peer of a port, both by index.
     Peer {
         port: usize,
         nth: usize,
@@ -45,7 +45,8 @@ enum DocumentStep {
     Controller,
     Latency,
     Values,
-    /// From this place on. Places, not counts: a variable that becomes known meanwhile moves no other.
+    /// Variables from this place on. It is a place and not a count, so a variable that becomes known meanwhile moves no
+    /// other.
     ValuesFrom {
         from: usize,
         is_first: bool,
@@ -54,7 +55,7 @@ enum DocumentStep {
 }
 
 impl Pieces {
-    /// The beginning of a document.
+    /// Starts at the beginning of a document.
     pub const fn of(document: Document) -> Self {
         let next = match document {
             Document::Status => DocumentStep::Status,
@@ -63,10 +64,10 @@ impl Pieces {
         Self { next }
     }
 
-    /// Writes the next piece, which may be empty; `false` if there is none left.
+    /// Writes the next piece, which may be empty. Returns `false` if none is left.
     ///
     /// # Errors
-    /// If `out` has no room. The document cannot be continued then.
+    /// If `out` has no room. The document cannot be continued after that.
     pub fn write_next(&mut self, status: Status<'_>, out: &mut impl Write) -> Result<bool, JsonError> {
         self.next = match self.next {
             DocumentStep::Status => {
@@ -156,14 +157,14 @@ impl Pieces {
         Ok(true)
     }
 
-    /// Writes all pieces of one instant.
+    /// Writes the whole document from one status.
     pub fn write_all(mut self, status: Status<'_>, out: &mut impl Write) -> Result<(), JsonError> {
         while self.write_next(status, out)? {}
         Ok(())
     }
 }
 
-/// Holds the end of an object back, so that more can be added to it.
+/// Omits the closing brace of an object, so more entries can be added.
 struct Open<'w, W> {
     out: &'w mut W,
     is_end_held: bool,
@@ -187,7 +188,7 @@ impl<W: Write> Write for Open<'_, W> {
     }
 }
 
-/// The place of a variable, or behind all of them of a bit.
+/// The place of a variable, or of one of its bits; bits come after all variables.
 fn place(var: SysVar, bit: Option<u8>) -> usize {
     match bit {
         None => var.ordinal(),

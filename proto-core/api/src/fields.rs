@@ -1,12 +1,12 @@
-//! The fields of a struct of counters, by name: names are written once, in the struct.
+//! The fields of a struct of counters by name, so their names are written only once, in the struct.
 
 use core::fmt;
 
 use serde::ser::{self, Impossible, Serialize, Serializer};
 
-/// Calls `found` with each field that is an unsigned number.
+/// Calls `found` with each field that is an unsigned integer.
 pub(crate) fn each(counters: &impl Serialize, mut found: impl FnMut(&'static str, u64)) {
-    // What has no such fields has none to report.
+    // A type without such fields reports none.
     let _ = counters.serialize(FieldVisitor { field: None, found: &mut found });
 }
 
@@ -42,7 +42,7 @@ impl<F: FnMut(&'static str, u64)> ser::SerializeStruct for FieldVisitor<'_, F> {
         key: &'static str,
         value: &T,
     ) -> Result<(), NoFields> {
-        // Fields that are no unsigned numbers are left out.
+        // Fields that are not unsigned integers are skipped.
         let _ = value.serialize(FieldVisitor { field: Some(key), found: &mut *self.found });
         Ok(())
     }

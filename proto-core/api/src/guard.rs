@@ -1,8 +1,7 @@
-//! Who may do what: hosts, origins, types, lengths and keys are checked here, in this order, before a driver
-//! carries anything out.
+//! Who may do what: checks hosts, origins, types, lengths and keys, in this order, before a driver executes anything.
 //!
-//! In: the head of a request, the addresses of its connection, the present. Out: the operation, or a refusal.
-//! Does not read bodies; a signed request names the hash of its body, which [`Admitted::is_body`] compares.
+//! In: the head of a request, the addresses of its connection, the current time. Out: the operation, or a refusal.
+//! Does not know bodies: a signed request names the hash of its body, which [`Admitted::is_body`] compares.
 
 use core::net::IpAddr;
 
@@ -23,7 +22,7 @@ pub const MAX_IMAGE: u64 = 16 << 10;
 /// Maximum length of arguments for a board in bytes.
 pub const MAX_ARGUMENTS: u64 = 256;
 
-/// The key, and what has to be remembered about requests with and without it.
+/// The key, and what has to be remembered about requests.
 #[derive(Debug, Clone)]
 pub struct Guard {
     key: Option<Key>,
@@ -37,32 +36,32 @@ pub struct Guard {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 #[non_exhaustive]
 pub struct RequestCounters {
-    /// Requests that were carried out.
+    /// Requests that were admitted.
     pub admitted: u32,
-    /// Requests that no endpoint takes: path, method, type or length.
+    /// Requests that match no endpoint in path, method, type or length.
     pub unfit: u32,
-    /// Requests for another host: a name that was made to point here.
+    /// Requests for another host, such as a foreign name that resolves to this address (DNS rebinding).
     pub wrong_host: u32,
-    /// Requests of pages of another origin.
+    /// Requests from pages of another origin.
     pub cross_site: u32,
     /// Requests without the key they need.
     pub without_key: u32,
     /// Requests with a wrong key or signature.
     pub wrong_key: u32,
-    /// Signed requests that were sent before, or too late.
+    /// Signed requests whose nonce was already used or too old.
     pub replayed: u32,
-    /// Requests that were not looked at, after too many wrong keys.
+    /// Requests that were refused unchecked, after too many wrong keys.
     pub locked_out: u32,
 }
 
 /// The addresses of a connection.
 #[derive(Debug, Clone, Copy)]
 pub struct Site<'a> {
-    /// This end.
+    /// The fields that a signature covers, with a line feed after each of the four.
     pub local: IpAddr,
-    /// The other end.
+    /// The address of the other end.
     pub peer: IpAddr,
-    /// Names that this server has, in addition to its address and `localhost`.
+    /// Names of this server, in addition to its address and `localhost`.
     pub names: &'a [&'a str],
 }
 
@@ -72,8 +71,8 @@ impl Site<'_> {
         self.local.to_canonical().is_loopback() && self.peer.to_canonical().is_loopback()
     }
 
-    /// Whether a request for this host is for us. A page of another site can make its own name point to our
-    /// address; then it may read what we answer, but it cannot choose what the browser says the host is.
+    /// Whether `name` is this server. A page of another site can make its own name resolve to our address and then read
+    /// our responses (DNS rebinding), but it cannot choose the host that the browser sends.
     fn is_host(&self, name: &str) -> bool {
         let bare = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
         match address::parse(bare) {
@@ -84,50 +83,50 @@ impl Site<'_> {
     }
 }
 
-/// A request that may be carried out, once its body is there.
+/// A request that may be executed once its body has arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Admitted {
-    /// What it asks for.
+    /// The requested operation.
     pub operation: ApiOperation,
     /// Only the head of the response is wanted.
     pub is_head: bool,
     /// Length of the body in bytes.
     pub length: u64,
-    /// The client waits for [`crate::response::CONTINUE`].
+    /// The client waits for [`crate::response::CONTINUE`] before it sends the body.
     pub expects_continue: bool,
     body: Option<Hash>,
 }
 
 impl Admitted {
-    /// Whether a body with this hash is the one that was signed.
+    /// Whether `hash` is the signed hash of the body; true if the request is not signed.
     pub fn is_body(&self, hash: &Hash) -> bool {
-        // No secret: whoever listens sees both.
+        // Constant time is not needed: the hash is no secret, an eavesdropper sees both.
         self.body.is_none_or(|signed| signed == *hash)
     }
 
-    /// Whether [`Admitted::is_body`] has to be asked.
+    /// Whether the body has to be checked with [`Admitted::is_body`].
     pub const fn is_signed(&self) -> bool {
         self.body.is_some()
     }
 }
 
-/// Why a request is not carried out.
+/// Why a request is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Refusal {
     /// The status of the response.
     pub status: StatusCode,
-    /// For people.
+    /// An explanation for people.
     pub text: &'static str,
-    /// `Allow`, with 405.
+    /// The value of `Allow`, for status 405.
     pub allow: Option<&'static str>,
-    /// `Retry-After` in seconds, with 429.
+    /// The value of `Retry-After` in seconds, for status 429.
     pub retry_after_s: Option<u64>,
 }
 
 impl Refusal {
-    /// A refusal without further fields.
+    /// A refusal without header fields of its own.
     pub const fn new(status: StatusCode, text: &'static str) -> Self {
         Self { status, text, allow: None, retry_after_s: None }
     }
@@ -154,8 +153,8 @@ impl From<HeadError> for Refusal {
 }
 
 impl Guard {
-    /// A guard with this key; without one nothing can be changed, and nothing is told over a network.
-    /// `secret` is random, and another after each start.
+    /// A guard with this key. Without a key nothing can be changed, and nothing can be read over a network.
+    /// `secret` is random and different after each start.
     pub fn new(key: Option<Key>, secret: Hash) -> Self {
         Self {
             key,
@@ -171,7 +170,7 @@ impl Guard {
         self.key.is_some()
     }
 
-    /// Sets the key, such as one that a board was given.
+    /// Sets the key, for example when a board was claimed.
     pub fn set_key(&mut self, key: Option<Key>) {
         self.key = key;
     }
@@ -186,7 +185,7 @@ impl Guard {
         self.nonces.give(now)
     }
 
-    /// Decides about a request.
+    /// Admits or refuses a request.
     pub fn admit(
         &mut self,
         now: Instant,
@@ -257,7 +256,7 @@ impl Guard {
         }
         let is_fit = match head.content_type {
             Some(content_type) => route.body == BodyType::None || route.body.is(content_type),
-            // Of JSON all may be left out.
+            // A JSON body is optional.
             None => matches!(route.body, BodyType::None | BodyType::Json) && head.length == 0,
         };
         if !is_fit {
@@ -270,7 +269,7 @@ impl Guard {
         }
         let body = match route.access {
             Access::Open => None,
-            // So that a person finds out that it can be claimed, and how.
+            // Tells a person that the board can be claimed, and how.
             Access::Read
                 if served == Served::Board && self.key.is_none() && route.operation == ApiOperation::Info =>
             {
@@ -288,7 +287,7 @@ impl Guard {
         })
     }
 
-    /// Checks the key, and returns the hash of the body that was signed.
+    /// Checks the key, and returns the signed hash of the body, if any.
     fn authorize(
         &mut self,
         now: Instant,
@@ -313,7 +312,7 @@ impl Guard {
             return refuse(Why::WithoutKey, StatusCode::UNAUTHORIZED, "the key is needed");
         };
         let proof = match cut(shown, b' ') {
-            // Over a network everybody could read it.
+            // Loopback only: over a network anyone could read the key.
             Some((scheme, key)) if scheme.eq_ignore_ascii_case("Bearer") && site.is_loopback() => {
                 Proof::Key(trim(key))
             }
@@ -377,13 +376,13 @@ fn refuse<T>(why: Why, status: StatusCode, text: &'static str) -> Decision<T> {
     Err((why, Refusal::new(status, text)))
 }
 
-/// Whether a browser says that the request comes from a page of another server.
+/// Whether the browser reports that the request comes from a page of another origin.
 fn is_cross_site(head: &HttpHead<'_>) -> bool {
     let is_ours = |origin: &str| {
         let authority = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
         authority.is_some_and(|authority| authority.eq_ignore_ascii_case(head.host))
     };
-    // `none`: a person typed the address.
+    // Browsers send `none` if a person typed the address.
     let is_own_page = |site: &str| site == "same-origin" || site == "none";
     !head.origin.is_none_or(is_ours) || !head.fetch_site.is_none_or(is_own_page)
 }
@@ -422,7 +421,7 @@ impl<'a> Signature<'a> {
             }
         }
         let (nonce, body) = (nonce?, body?);
-        // It is compared as bytes, but signed as text: there must be one text for each hash.
+        // The hash is compared as bytes but signed as text, so each hash must have exactly one text.
         let is_hash =
             key::from_hex::<32>(body).is_some() && !body.bytes().any(|byte| byte.is_ascii_uppercase());
         is_hash.then_some(Self { nonce, body, mac: key::from_hex(mac?)? })

@@ -1,4 +1,4 @@
-//! Requests that a guard takes, and all the others.
+//! Requests that a guard admits or refuses.
 
 use super::*;
 use crate::key::{BodyHash, Hex};
@@ -65,7 +65,7 @@ fn on_one_machine_reading_is_free_and_writing_takes_the_key() {
     assert_eq!(status(&LOOPBACK, &format!("{write}\nAuthorization: bearer  {KEY}")), 200);
     assert_eq!(status(&LOOPBACK, &format!("{write}\nAuthorization: Bearer {}", "1".repeat(32))), 401);
     assert_eq!(status(&LOOPBACK, &format!("{write}\nAuthorization: Basic {KEY}")), 401);
-    // Whoever shows a key, shows the right one.
+    // A key that is sent must be right, even where none is needed.
     assert_eq!(
         status(&LOOPBACK, "GET /api/v1/status HTTP/1.1\nHost: localhost\nAuthorization: Bearer 00"),
         401
@@ -90,13 +90,13 @@ fn over_a_network_everything_is_signed() {
     assert!(admitted.is_body(&body.clone().finish()));
     body.update(b" ");
     assert!(!admitted.is_body(&body.finish()));
-    // Once more.
+    // The same request a second time.
     let refused = ask(&mut guard, at(1), &NETWORK, &request).unwrap_err();
     assert_eq!(
         (refused.status, refused.text),
         (StatusCode::UNAUTHORIZED, "this nonce was used; take a new one")
     );
-    // And too late.
+    // A request that is too old.
     let request = signed(&mut guard, at(2), "POST", "/api/v1/confirm", b"");
     assert_eq!(ask(&mut guard, at(33), &NETWORK, &request).unwrap_err().status, StatusCode::UNAUTHORIZED);
     assert_eq!(guard.counters().replayed, 2);
@@ -118,7 +118,7 @@ fn a_signature_is_for_one_request() {
             "{to}"
         );
     }
-    // A nonce of another run, rightly signed.
+    // A nonce of another run, with a valid signature.
     let other = Guard::new(Key::parse(KEY), [6; 32]).nonce(at(0));
     let foreign = with_nonce(&other, "POST", "/api/v1/confirm", b"");
     assert_eq!(ask(&mut guard, at(0), &NETWORK, &foreign).unwrap_err().status, StatusCode::UNAUTHORIZED);

@@ -1,7 +1,7 @@
-//! JSON without an allocator: values that serde knows, written to any [`core::fmt::Write`].
+//! A JSON serializer for serde without an allocator, which writes to any [`core::fmt::Write`].
 //!
-//! Numbers that are not finite are `null`, as JSON has none. Bytes are an array of numbers. Writing fails only
-//! if the receiver of the text has no room, or a map has a key that is no text and no number.
+//! Numbers that are not finite become `null`, as JSON has none. Bytes become an array of numbers. Writing fails only
+//! if the writer has no room, or if a map has a key that is neither a text nor a number.
 
 use core::fmt::{self, Write};
 
@@ -12,9 +12,9 @@ use crate::number::{Shortest, Signed, Whole};
 /// Why a value was not written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum JsonError {
-    /// The receiver has no room.
+    /// The writer has no room.
     NoRoom,
-    /// A key of a map is no text and no number, or a value refuses to be written.
+    /// A key of a map is neither a text nor a number, or a value refuses to be serialized.
     Unsupported,
 }
 
@@ -44,24 +44,24 @@ impl From<fmt::Error> for JsonError {
 /// Writes a value.
 ///
 /// # Errors
-/// If there is no room, or a key of a map is no text and no number.
+/// If there is no room, or a key of a map is neither a text nor a number.
 pub fn write(out: &mut impl Write, value: &(impl Serialize + ?Sized)) -> Result<(), JsonError> {
     value.serialize(Json(out))
 }
 
-/// Writes a text in quotes.
+/// Writes a text as a quoted JSON string.
 pub fn write_text(out: &mut impl Write, text: impl fmt::Display) -> fmt::Result {
     out.write_char('"')?;
     write!(Escaped(out), "{text}")?;
     out.write_char('"')
 }
 
-/// Escapes what a string of JSON may not contain.
+/// Escapes the characters that a JSON string must not contain.
 struct Escaped<'w, W>(&'w mut W);
 
 impl<W: Write> Write for Escaped<'_, W> {
     fn write_str(&mut self, text: &str) -> fmt::Result {
-        // Runs without anything to escape are written in one piece.
+        // Characters that need no escape are written in runs.
         let mut rest = text;
         while let Some(at) = rest.find(|c: char| matches!(c, '"' | '\\') || c < ' ') {
             let (plain, behind) = rest.split_at_checked(at).ok_or(fmt::Error)?;
@@ -81,7 +81,7 @@ impl<W: Write> Write for Escaped<'_, W> {
 
 struct Json<'w, W>(&'w mut W);
 
-/// An array or object that was begun.
+/// An array or object that is being written.
 struct Items<'w, W> {
     out: &'w mut W,
     is_first: bool,
@@ -134,7 +134,7 @@ macro_rules! signed_numbers {
     };
 }
 
-/// What a serializer makes of everything that has elements.
+/// The serializers of all types with elements.
 macro_rules! compounds {
     ($type:ty) => {
         type SerializeSeq = $type;
@@ -178,7 +178,7 @@ impl<'w, W: Write> Serializer for Json<'w, W> {
 
     fn serialize_f64(self, value: f64) -> Result<(), JsonError> {
         match value.is_finite() {
-            // With an exponent where it is shorter, unlike `Display`. No document of a board has such a number.
+            // Uses an exponent where that is shorter, unlike `Display`. No document of a board contains an `f64`.
             true => Ok(write!(self.0, "{value:?}")?),
             false => self.serialize_unit(),
         }
@@ -499,7 +499,7 @@ mod tests {
             prop_assert_eq!(ours, theirs);
         }
 
-        /// Some have two texts of the same length, so only what is read counts.
+        /// Some numbers have two shortest texts of the same length, so the test compares values.
         #[test]
         fn a_number_of_32_bits_is_read_as_the_same(number in any::<f32>()) {
             prop_assert_eq!(written(&number).parse(), Ok(number));

@@ -1,22 +1,22 @@
-//! The key of a gateway: 128 random bits, and how a client shows that it has them.
+//! The key of a gateway: 128 random bits, and how a client proves that it has them.
 //!
-//! On one machine the key itself is sent (`Bearer`). Over a network, where others can listen, it never is: the
-//! client signs each request (docs/api.md section 3). All comparisons take the same time whatever differs.
+//! On one machine the client sends the key itself (`Bearer`). Over a network, where others can listen, it never does:
+//! it signs each request (docs/api.md section 3). All comparisons take constant time.
 
 use core::fmt;
 
 use hmac::{Hmac, KeyInit, Mac};
 use sha2::{Digest, Sha256};
 
-/// Number of bytes of a key.
+/// Length of a key in bytes.
 pub const KEY_LEN: usize = 16;
-/// The name of the scheme in `Authorization` for signed requests.
+/// The `Authorization` scheme of signed requests.
 pub const SCHEME: &str = "RGW-HMAC-SHA256";
 
 /// A SHA-256 hash.
 pub type Hash = [u8; 32];
 
-/// A key. It is never shown, also not by `Debug`.
+/// A key. It is never shown, not even by `Debug`.
 #[derive(Clone)]
 pub struct Key([u8; KEY_LEN]);
 
@@ -27,12 +27,12 @@ impl fmt::Debug for Key {
 }
 
 impl Key {
-    /// The key of these bytes.
+    /// Makes a key from its bytes.
     pub const fn new(bytes: [u8; KEY_LEN]) -> Self {
         Self(bytes)
     }
 
-    /// The key written as 32 hexadecimal digits; `None` if it is anything else, or all digits are equal.
+    /// Parses a key of 32 hexadecimal digits. `None` if the text is anything else, or all digits are equal.
     pub fn parse(text: &str) -> Option<Self> {
         let bytes: [u8; KEY_LEN] = from_hex(text)?;
         let first = *bytes.first()?;
@@ -40,8 +40,8 @@ impl Key {
         (!is_filler).then_some(Self(bytes))
     }
 
-    /// Whether `text` is this key in hexadecimal. The time it takes depends on the length of `text` alone:
-    /// both are hashed with a random `secret` before they are compared.
+    /// Whether `text` is this key in hexadecimal. The time depends only on the length of `text`: both are hashed with a
+    /// random `secret` before they are compared.
     pub fn is(&self, text: &str, secret: &Hash) -> bool {
         let Some(shown) = from_hex::<KEY_LEN>(text) else { return false };
         is_same(&authenticate(secret, &[&shown]), &authenticate(secret, &[&self.0]), secret)
@@ -52,20 +52,20 @@ impl Key {
         authenticate(&self.0, &what.parts())
     }
 
-    /// Whether `signature` is that of a request.
+    /// Whether `signature` is the signature of this request.
     pub fn verify(&self, what: &Signed<'_>, signature: &Hash) -> bool {
         verify(&self.0, &what.parts(), signature)
     }
 }
 
-/// What a signature covers: these five, with a line end after each of the first four.
+/// The fields that a signature covers, with a line feed after each of the four.
 #[derive(Debug, Clone, Copy)]
 pub struct Signed<'a> {
     /// The nonce, as text.
     pub nonce: &'a str,
     /// The method.
     pub method: &'a str,
-    /// Path and query, as they are sent.
+    /// Path and query, as sent.
     pub target: &'a str,
     /// The SHA-256 of the body, as 64 lower-case hexadecimal digits.
     pub body: &'a str,
@@ -79,12 +79,12 @@ impl<'a> Signed<'a> {
     }
 }
 
-/// The hash of a body that arrives in pieces.
+/// Computes the hash of a body that arrives in pieces.
 #[derive(Debug, Clone, Default)]
 pub struct BodyHash(Sha256);
 
 impl BodyHash {
-    /// Of a body without a byte.
+    /// The hash of no bytes yet.
     pub fn new() -> Self {
         Self::default()
     }
@@ -112,7 +112,7 @@ pub(crate) fn verify(key: &[u8], parts: &[&[u8]], expected: &[u8]) -> bool {
     mac(key, parts).is_some_and(|mac| mac.verify_truncated_left(expected).is_ok())
 }
 
-/// `None` never happens: HMAC takes keys of any length.
+/// Never `None`: HMAC accepts keys of any length.
 fn mac(key: &[u8], parts: &[&[u8]]) -> Option<Hmac<Sha256>> {
     let mut mac = Hmac::<Sha256>::new_from_slice(key).ok()?;
     parts.iter().for_each(|part| mac.update(part));
@@ -124,7 +124,7 @@ fn is_same(one: &Hash, other: &Hash, secret: &Hash) -> bool {
     verify(secret, &[one], &authenticate(secret, &[other]))
 }
 
-/// The bytes of `N` pairs of hexadecimal digits.
+/// Decodes exactly `N` pairs of hexadecimal digits.
 pub fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
     let (pairs, []) = text.as_bytes().as_chunks::<2>() else { return None };
     if pairs.len() != N {
@@ -138,7 +138,7 @@ pub fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
     Some(bytes)
 }
 
-/// Bytes that display as lower-case hexadecimal digits.
+/// Displays bytes as lower-case hexadecimal digits.
 #[derive(Debug, Clone, Copy)]
 pub struct Hex<'a>(pub &'a [u8]);
 
@@ -190,7 +190,7 @@ mod tests {
         assert_eq!(format!("{}", Hex(&body.finish())), expected);
     }
 
-    /// The example of docs/api.md, which is worked out with openssl there.
+    /// The example of docs/api.md, where it is computed with openssl.
     #[test]
     fn a_signature_covers_all_four() {
         let key = Key::parse("00112233445566778899aabbccddeeff").unwrap();

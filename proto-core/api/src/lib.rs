@@ -1,8 +1,8 @@
-//! The API of a gateway over HTTP/1.1, for a host and a board alike: docs/api.md has its endpoints.
+//! The HTTP/1.1 API of a gateway, for a host and a board alike: docs/api.md has its endpoints.
 //!
-//! In: the bytes of a request, the present, a [`proto_core::engine::Status`]. Out: an operation that may be
-//! carried out or a refusal, and the bytes of the response. Knows no sockets, no clock, no files and no TOML,
-//! and nothing here allocates.
+//! In: the bytes of a request, the current time, a [`proto_core::engine::Status`]. Out: an operation that may be
+//! executed, or a refusal, and the bytes of the response. Does not know sockets, clocks, files or TOML, and allocates
+//! nothing.
 //!
 //! A driver serves a connection like this; each connection carries one request:
 //!

@@ -15,7 +15,7 @@ use serde::Serialize;
 use crate::fields;
 use crate::number::Whole;
 
-/// The families that are being written.
+/// The metric families of a gateway, written one after another.
 #[derive(Debug, Clone)]
 pub struct Families {
     next: MetricsStep,
@@ -26,7 +26,7 @@ enum MetricsStep {
     Health,
     PortUp,
     PortAge,
-    /// Of this port: with all of them it would be the longest piece by far.
+    /// The rejections of one port. Those of all ports together would be the longest piece by far.
     Rejected(usize),
     PortCounter(usize),
     LinkUp,
@@ -44,15 +44,16 @@ impl Default for Families {
 }
 
 impl Families {
-    /// The first family is next.
+    /// Starts at the first family.
     pub const fn new() -> Self {
         Self { next: MetricsStep::Health }
     }
 
-    /// Writes the next family, or a part of one, which may be empty; `false` if none is left and the text is complete.
+    /// Writes the next family, or a part of one, which may be empty. Returns `false` if none is left: the text is
+    /// complete.
     ///
     /// # Errors
-    /// Those of `out`. The text cannot be continued then.
+    /// If `out` fails. The text cannot be continued after that.
     pub fn write_next(&mut self, status: Status<'_>, out: &mut impl Write) -> Result<bool, fmt::Error> {
         self.next = match self.next {
             MetricsStep::Health => {
@@ -147,14 +148,14 @@ impl Families {
         Ok(true)
     }
 
-    /// Writes everything.
+    /// Writes all families.
     pub fn write_all(mut self, status: Status<'_>, out: &mut impl Write) -> fmt::Result {
         while self.write_next(status, out)? {}
         Ok(())
     }
 }
 
-/// The counters of a port's rejections, which are of one family.
+/// The rejection counters of a port; they form one family.
 fn rejected(port: &PortStatus<'_>, out: &mut impl Write) -> fmt::Result {
     let mut written = Ok(());
     fields::each(port.counters, |name, value| {
@@ -172,7 +173,7 @@ fn rejected(port: &PortStatus<'_>, out: &mut impl Write) -> fmt::Result {
     written
 }
 
-/// The family of the `nth` field that is a count; `false` if there is no such field.
+/// Writes the family of the `nth` field that is a count. Returns `false` if there is no such field.
 fn counter<'a, C: Serialize + 'a>(
     out: &mut impl Write,
     of: &str,
@@ -183,7 +184,7 @@ fn counter<'a, C: Serialize + 'a>(
     for (label, counters) in all {
         let (mut at, mut written) = (0_usize, Ok(()));
         fields::each(counters, |name, value| {
-            // Rejections are one family; times are in the histograms.
+            // Rejections have a family of their own; times are in the histograms.
             if name.starts_with(REJECTED) || name.ends_with("_us") {
                 return;
             }
@@ -211,7 +212,7 @@ fn write_histogram(out: &mut impl Write, name: &str, histogram: &Histogram) -> f
         count = count.saturating_add((*samples).into());
         write!(out, "rgw_{name}_seconds_bucket{{le=\"")?;
         match nth.saturating_add(1) < BUCKETS {
-            // A bucket holds what is shorter than its end, in whole microseconds.
+            // A bucket counts durations shorter than its end, in whole microseconds.
             true => write!(
                 out,
                 "{}",
@@ -227,7 +228,7 @@ fn write_histogram(out: &mut impl Write, name: &str, histogram: &Histogram) -> f
 
 const REJECTED: &str = "rejected_";
 
-/// A time in seconds, exactly.
+/// A duration, written in seconds without rounding.
 struct Seconds(Duration);
 
 impl fmt::Display for Seconds {
@@ -237,7 +238,7 @@ impl fmt::Display for Seconds {
     }
 }
 
-/// The value of a label, with what would end it escaped.
+/// A label value; quotes, backslashes and line feeds are escaped.
 struct Label<'a>(&'a str);
 
 impl fmt::Display for Label<'_> {

@@ -1,8 +1,8 @@
 //! Nonces: each signed request carries one, which makes it valid once and only for a short time.
 //!
-//! Whoever asks gets one, so giving them out must cost nothing that could run out. A nonce therefore holds its
-//! own age and number, sealed with a secret of this run, and only nonces that a *right* signature has used are
-//! remembered. When there is no room for another, the oldest one is forgotten and everything as old is refused.
+//! Anyone may request a nonce, so handing one out must use up no resource. A nonce therefore contains its own time and
+//! number, sealed with a secret of this run. Only nonces that came with a *valid* signature are remembered. When there
+//! is no room for another, the oldest is forgotten, and every nonce that is as old or older is refused.
 
 use core::fmt::Write;
 
@@ -21,14 +21,14 @@ const LEN: usize = 24;
 /// A nonce as text.
 pub type NonceText = String<{ LEN * 2 }>;
 
-/// What was given out and used.
+/// Hands out nonces and remembers the used ones.
 #[derive(Debug, Clone)]
 pub struct Nonces {
     secret: Hash,
-    /// Number of the next one: two are different even if the clock stands still.
+    /// Number of the next nonce: nonces differ even if the clock stands still.
     next: u32,
     used: Vec<Used, MAX_USED>,
-    /// Older ones are refused.
+    /// Nonces that are as old as this or older are refused.
     floor: Option<Instant>,
 }
 
@@ -38,10 +38,10 @@ struct Used {
     number: u32,
 }
 
-/// Why a nonce does not count.
+/// Why a nonce is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NonceError {
-    /// This run did not give it out.
+    /// It was not handed out by this run.
     Unknown,
     /// It is too old.
     Old,
@@ -49,29 +49,29 @@ pub enum NonceError {
     Used,
 }
 
-/// A nonce of ours that may be used.
+/// A nonce that was checked and may be used.
 #[derive(Debug, Clone, Copy)]
 pub struct Fresh(Used);
 
 impl Nonces {
-    /// Without one. `secret` is random, and another after each start.
+    /// No nonces yet. `secret` is random and different after each start.
     pub const fn new(secret: Hash) -> Self {
         Self { secret, next: 0, used: Vec::new(), floor: None }
     }
 
-    /// Gives one out.
+    /// Hands out a nonce.
     pub fn give(&mut self, now: Instant) -> NonceText {
         let used = Used { at: now, number: self.next };
         self.next = self.next.wrapping_add(1);
         let (time, number, seal) =
             (now.as_micros().to_be_bytes(), used.number.to_be_bytes(), self.seal(used));
         let mut text = NonceText::new();
-        // It has room for all of them.
+        // Cannot fail: the text has room for all three.
         let _ = write!(text, "{}{}{}", Hex(&time), Hex(&number), Hex(&seal));
         text
     }
 
-    /// Whether a nonce may be used; it is not used by that.
+    /// Checks whether a nonce may be used, without using it.
     pub fn check(&self, now: Instant, text: &str) -> Result<Fresh, NonceError> {
         let bytes: [u8; LEN] = key::from_hex(text).ok_or(NonceError::Unknown)?;
         let (time, rest) = bytes.split_first_chunk::<8>().ok_or(NonceError::Unknown)?;
@@ -90,7 +90,7 @@ impl Nonces {
         }
     }
 
-    /// Uses it up.
+    /// Marks a nonce as used.
     pub fn spend(&mut self, now: Instant, fresh: Fresh) {
         self.used.retain(|used| now.saturating_since(used.at) <= MAX_AGE);
         let oldest = self.used.iter().map(|used| used.at).min();
@@ -100,7 +100,7 @@ impl Nonces {
             self.floor = self.floor.max(Some(oldest));
             self.used.retain(|used| used.at > oldest);
         }
-        // There is room now.
+        // Cannot fail: room was made above.
         let _ = self.used.push(fresh.0);
     }
 
@@ -154,7 +154,7 @@ mod tests {
         let mut given = std::vec::Vec::new();
         let mut now = START;
         for nth in 0_u64..200 {
-            // Several at the same instant.
+            // Several nonces at the same instant.
             now = START + Duration::from_micros(nth / 3);
             given.push(nonces.give(now));
             let text = given.last().unwrap();
@@ -163,7 +163,7 @@ mod tests {
             }
             assert!(given.iter().all(|used| nonces.check(now, used).is_err()), "after {nth}");
         }
-        // Asking for many takes nothing from those that are used in time.
+        // Handing out many nonces invalidates none of those used in time.
         let mine = nonces.give(now);
         (0..10_000).for_each(|_| drop(nonces.give(now)));
         assert!(nonces.check(now + Duration::from_secs(1), &mine).is_ok());

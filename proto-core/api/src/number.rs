@@ -1,14 +1,14 @@
-//! Numbers as decimal text. `core`'s own printing takes 10 KB of a board's flash, and contains panics that the
+//! Numbers as decimal text. The formatting in `core` takes 10 KB of a board's flash, and contains panics that the
 //! optimiser does not remove.
 //!
-//! The shortest text of a number of 32 bits is found as in Raffaello Giulietti, "The Schubfach way to render
-//! doubles" (2020), with its names: `q`, `k` and `h` are exponents, `g` is a power of ten.
+//! The shortest text of an `f32` is found as in Raffaello Giulietti, "The Schubfach way to render doubles" (2020), with
+//! the names of that paper: `q`, `k` and `h` are exponents, `g` is a power of ten.
 
 use core::fmt;
 
 use heapless::String;
 
-/// A whole number without a sign.
+/// An unsigned integer.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Whole(pub(crate) u64);
 
@@ -19,7 +19,7 @@ impl fmt::Display for Whole {
     }
 }
 
-/// A whole number with a sign.
+/// A signed integer.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Signed(pub(crate) i64);
 
@@ -32,12 +32,12 @@ impl fmt::Display for Signed {
     }
 }
 
-/// The digits of a number, at the end of `room`.
+/// Writes the digits of a number at the end of `room`.
 fn digits(number: u64, room: &mut [u8; 20]) -> Option<&str> {
     let (mut rest, mut start) = (number, room.len());
     for (place, digit) in room.iter_mut().enumerate().rev() {
         let last;
-        // Most numbers are short, and a board divides 64 bits in software.
+        // Most numbers are short, and a board does 64-bit divisions in software.
         (rest, last) = match u32::try_from(rest) {
             Ok(rest) => ((rest / 10).into(), (rest % 10) as u8),
             Err(_) => (rest / 10, (rest % 10) as u8),
@@ -51,8 +51,8 @@ fn digits(number: u64, room: &mut [u8; 20]) -> Option<&str> {
     str::from_utf8(room.get(start..)?).ok()
 }
 
-/// A number of 32 bits as the shortest text that is read as the same number, as `{:?}` writes it: with a point or
-/// an exponent. What is not finite has no such text.
+/// An `f32` as the shortest text that parses to the same number, as `{:?}` writes it: with a point or an exponent.
+/// Numbers that are not finite have no such text.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Shortest(pub(crate) f32);
 
@@ -69,7 +69,7 @@ impl fmt::Display for Shortest {
     }
 }
 
-/// Writes `digits` times the power of ten, with an exponent outside of 0.0001 to 10^16.
+/// Writes `digits * 10^power`, with an exponent outside of 0.0001 to 10^16.
 fn place_point((mut number, mut power): (u32, i32), text: &mut String<32>) -> Option<()> {
     while number != 0 && number % 10 == 0 {
         number /= 10;
@@ -77,7 +77,7 @@ fn place_point((mut number, mut power): (u32, i32), text: &mut String<32>) -> Op
     }
     let mut room = [0; 20];
     let digits = digits(number.into(), &mut room)?;
-    // So many digits are before the point, if there are as many.
+    // The number of digits before the point, if the number has that many.
     let before = power.saturating_add(digits.len() as i32);
     let zeros = |text: &mut String<32>, count: i32| (0..count).try_for_each(|_| text.push('0').ok());
     match usize::try_from(before) {
@@ -113,30 +113,30 @@ fn place_point((mut number, mut power): (u32, i32), text: &mut String<32>) -> Op
     Some(())
 }
 
-/// The number with these bits, which is above zero and finite, as `digits * 10^power`.
+/// The number with these bits, which must be positive and finite, as `digits * 10^power`.
 fn shortest(bits: u32) -> (u32, i32) {
     let (exponent, fraction) = ((bits >> 23) as i32, bits & 0x7F_FFFF);
     let (c, q) = match exponent {
         0 => (fraction, -149),
         _ => (1 << 23 | fraction, exponent.saturating_sub(150)),
     };
-    // At a power of two the numbers below are half as far apart.
+    // Below a power of two, neighbouring numbers are only half as far apart.
     let is_closer_below = fraction == 0 && exponent > 1;
     let is_odd = c & 1;
-    // floor(log10(2^q)), or of three quarters of it.
+    // floor(log10(2^q)), or floor(log10(3/4 * 2^q)).
     let k = q.wrapping_mul(1_262_611).wrapping_sub(if is_closer_below { 524_031 } else { 0 }) >> 22;
     // floor(log2(10^-k)).
     let h = q.wrapping_add(k.wrapping_mul(-1_741_647) >> 19).wrapping_add(1) as u32;
     let g = POWERS.get(FIRST_POWER.wrapping_add(k) as usize).copied().unwrap_or(0);
     let scaled = |quarters: u32| round_to_odd(g, quarters.wrapping_shl(h));
     let four = c.wrapping_mul(4);
-    // Four times the number and the ends of what is rounded to it, in units of 10^k.
+    // Four times the number, and the bounds of the interval that rounds to it, in units of 10^k.
     let value = scaled(four);
     let lower = scaled(four.wrapping_sub(if is_closer_below { 1 } else { 2 })).wrapping_add(is_odd);
     let upper = scaled(four.wrapping_add(2)).wrapping_sub(is_odd);
     let s = value / 4;
     if s >= 10 {
-        // One digit less, if exactly one of the neighbours is inside.
+        // One digit fewer, if exactly one of the two neighbours is in the interval.
         let tens = s / 10;
         let (below, above) = (tens.wrapping_mul(40), tens.wrapping_mul(40).wrapping_add(40));
         if (lower <= below) != (above <= upper) {
@@ -147,11 +147,11 @@ fn shortest(bits: u32) -> (u32, i32) {
     if (lower <= below) != (above <= upper) {
         return (s.wrapping_add(u32::from(above <= upper)), k);
     }
-    // The nearer one; of two, the upper one, as `core` does.
+    // The nearer one; of two equally near, the upper one, as `core` does.
     (s.wrapping_add(u32::from(value >= below.wrapping_add(2))), k)
 }
 
-/// `g * factor / 2^64`; odd if it is not exact.
+/// `g * factor / 2^64`, with the lowest bit set if the result is not exact.
 fn round_to_odd(g: u64, factor: u32) -> u32 {
     let part = |bits: u64| (bits & 0xFFFF_FFFF).wrapping_mul(factor.into());
     let product = part(g >> 32).wrapping_add(part(g) >> 32);
@@ -159,9 +159,9 @@ fn round_to_odd(g: u64, factor: u32) -> u32 {
 }
 
 const SIGN: u32 = 1 << 31;
-/// Powers of ten from 10^45 down to 10^-31, each rounded up to 64 bits.
+/// Powers of ten from 10^45 down to 10^-31, as their first 64 bits, rounded up.
 static POWERS: [u64; 77] = powers();
-/// The index of 10^0.
+/// The index of 10^0 in `POWERS`.
 const FIRST_POWER: i32 = 45;
 
 #[expect(clippy::arithmetic_side_effects, clippy::indexing_slicing, reason = "carried out by the compiler")]
@@ -178,7 +178,7 @@ const fn powers() -> [u64; 77] {
 /// The first 64 bits of 10^exponent, rounded up.
 #[expect(clippy::arithmetic_side_effects, reason = "carried out by the compiler")]
 const fn power(exponent: i32) -> u64 {
-    // 10 is 5 times a power of two.
+    // 10^n is 5^n times a power of two.
     let five = 5_u128.pow(exponent.unsigned_abs());
     let bits = u128::BITS - five.leading_zeros();
     if exponent >= 0 {
@@ -187,7 +187,7 @@ const fn power(exponent: i32) -> u64 {
             None => (five as u64) << (64 - bits),
         };
     }
-    // 2^(63 + bits) divided by it.
+    // 2^(63 + bits) divided by the power of five.
     let (mut rest, mut quotient, mut bit) = (1_u128 << (bits - 1), 0_u64, 0);
     while bit < 64 {
         rest *= 2;

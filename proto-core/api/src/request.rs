@@ -1,8 +1,10 @@
 //! The head of an HTTP/1.1 request: the request line and the header fields.
 //!
-//! In: received bytes, in pieces of any size. Out: a [`HttpHead`], or why there is none. Does not know paths,
-//! keys or bodies. A request is refused rather than guessed at: a field that matters may come once, lines end
-//! with CR LF, and a body has a `Content-Length`.
+//! In: received bytes, in pieces of any size. Out: an [`HttpHead`], or the reason why there is none. Does not know
+//! paths,
+//! keys or bodies. An ambiguous request is refused, not interpreted: a field that matters may occur once, lines end
+//! with
+//! CR LF, and a body has a `Content-Length`.
 
 use core::str;
 
@@ -11,12 +13,12 @@ pub const MAX_HEAD: usize = 2048;
 /// Maximum number of header fields.
 pub const MAX_FIELDS: usize = 32;
 
-/// The bytes of a head, while they arrive, in memory of [`MAX_HEAD`] bytes.
+/// Collects the bytes of a head as they arrive, in a buffer of [`MAX_HEAD`] bytes.
 #[derive(Debug, Clone)]
 pub struct HeadBuffer<B = [u8; MAX_HEAD]> {
     bytes: B,
     len: usize,
-    /// The newest four bytes.
+    /// The last four bytes.
     tail: [u8; 4],
     is_complete: bool,
 }
@@ -28,14 +30,15 @@ impl Default for HeadBuffer {
 }
 
 impl HeadBuffer {
-    /// Without a byte.
+    /// An empty buffer.
     pub const fn new() -> Self {
         Self { bytes: [0; MAX_HEAD], len: 0, tail: [0; 4], is_complete: false }
     }
 }
 
 impl<'b> HeadBuffer<&'b mut [u8]> {
-    /// Without a byte, in memory of the caller's. In less than [`MAX_HEAD`] bytes a head that is longer never becomes
+    /// An empty buffer in memory of the caller. With less than [`MAX_HEAD`] bytes, a head that does not fit never
+    /// becomes
     /// complete.
     pub const fn within(bytes: &'b mut [u8]) -> Self {
         Self { bytes, len: 0, tail: [0; 4], is_complete: false }
@@ -43,13 +46,13 @@ impl<'b> HeadBuffer<&'b mut [u8]> {
 }
 
 impl<B: AsRef<[u8]> + AsMut<[u8]>> HeadBuffer<B> {
-    /// Whether nothing has arrived.
+    /// Whether nothing has arrived yet.
     pub const fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// Takes received bytes up to the end of the head, and returns their number. The rest is the beginning of
-    /// the body. Takes nothing if the head is complete, or is too long.
+    /// Takes received bytes up to the end of the head, and returns how many. The rest is the beginning of the body.
+    /// Takes nothing if the head is complete or too long.
     pub fn push(&mut self, bytes: &[u8]) -> usize {
         if self.is_complete {
             return 0;
@@ -69,10 +72,10 @@ impl<B: AsRef<[u8]> + AsMut<[u8]>> HeadBuffer<B> {
         taken
     }
 
-    /// The head.
+    /// Parses the head.
     ///
     /// # Errors
-    /// [`HeadError::Incomplete`] while more bytes are needed, or why the request is refused.
+    /// [`HeadError::Incomplete`] while more bytes are needed; otherwise why the request is refused.
     pub fn head(&self) -> Result<HttpHead<'_>, HeadError> {
         match (self.is_complete, self.bytes.as_ref().get(..self.len)) {
             (true, Some(head)) => HttpHead::parse(head),
@@ -87,18 +90,18 @@ impl<B: AsRef<[u8]> + AsMut<[u8]>> HeadBuffer<B> {
 pub enum Method {
     /// `GET`.
     Get,
-    /// `HEAD`: the head that `GET` would get.
+    /// `HEAD`: as `GET`, but only the head is returned.
     Head,
     /// `POST`.
     Post,
     /// `PUT`.
     Put,
-    /// Any other; none of them is ever allowed.
+    /// Any other method; no endpoint allows one.
     Other,
 }
 
 impl Method {
-    /// As it is on the wire; empty for [`Method::Other`].
+    /// The name on the wire; empty for [`Method::Other`].
     pub const fn name(self) -> &'static str {
         match self {
             Self::Get => "GET",
@@ -115,19 +118,19 @@ impl Method {
     }
 }
 
-/// A request without its body.
+/// The head of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct HttpHead<'a> {
     /// The method.
     pub method: Method,
-    /// Path and query, as they were sent.
+    /// Path and query, as sent.
     pub target: &'a str,
     /// `Host`: a name or address, with or without a port.
     pub host: &'a str,
-    /// `Origin`: of the page that makes the request; only browsers send it.
+    /// `Origin`: the origin of the page that makes the request. Only browsers send it.
     pub origin: Option<&'a str>,
-    /// `Sec-Fetch-Site`: how that page and this server are related; only browsers send it.
+    /// `Sec-Fetch-Site`: how that page is related to this server. Only browsers send it.
     pub fetch_site: Option<&'a str>,
     /// `Authorization`.
     pub authorization: Option<&'a str>,
@@ -149,17 +152,17 @@ pub struct HttpHead<'a> {
 pub enum HeadError {
     /// More bytes are needed.
     Incomplete,
-    /// It is longer than [`MAX_HEAD`], or has more than [`MAX_FIELDS`] fields.
+    /// The head is longer than [`MAX_HEAD`], or has more than [`MAX_FIELDS`] fields.
     TooLong,
-    /// It is not a request of HTTP/1.x, such as a field without a colon.
+    /// It is no HTTP/1.x request, for example because a field has no colon.
     Malformed,
-    /// It is of another version than HTTP/1.1.
+    /// The version is not HTTP/1.1.
     Version,
     /// There is no `Host`.
     NoHost,
-    /// A field that may come once comes twice.
+    /// A field that may occur once occurs twice.
     Repeated,
-    /// The body's length is not known before its end.
+    /// The body has no known length, such as with `Transfer-Encoding`.
     NoLength,
     /// `Expect` is not `100-continue`.
     Expectation,
@@ -167,7 +170,7 @@ pub enum HeadError {
 
 impl<'a> HttpHead<'a> {
     fn parse(bytes: &'a [u8]) -> Result<Self, HeadError> {
-        // Anything else could be read in two ways, or hide in a log.
+        // Other characters could be read in two ways, or hide something in a log.
         let is_text = |byte: &u8| matches!(byte, b' '..=b'~' | 0x80.. | b'\t' | b'\r' | b'\n');
         if !bytes.iter().all(is_text) {
             return Err(HeadError::Malformed);
@@ -210,7 +213,7 @@ impl<'a> HttpHead<'a> {
                 return Err(HeadError::TooLong);
             }
             let (name, value) = cut(line, b':').ok_or(HeadError::Malformed)?;
-            // Neither a blank before the colon nor one at the beginning: a line that continues the one before.
+            // Refuses blanks before the colon, and blanks at the start of a line, which would continue the one before.
             if name.is_empty() || !name.bytes().all(is_of_token) {
                 return Err(HeadError::Malformed);
             }
@@ -227,7 +230,7 @@ impl<'a> HttpHead<'a> {
                 name if name.eq_ignore_ascii_case("transfer-encoding") => return Err(HeadError::NoLength),
                 _ => continue,
             };
-            // A field of ours is ASCII; cookies of others may be anything.
+            // The fields that are read here are ASCII. Others, such as cookies, may contain anything.
             if !value.is_ascii() {
                 return Err(HeadError::Malformed);
             }
@@ -235,7 +238,7 @@ impl<'a> HttpHead<'a> {
                 return Err(HeadError::Repeated);
             }
         }
-        // The last line is empty; a line that is none, such as for a CR alone, was taken for it.
+        // The loop ends at the empty line, but also at a malformed line, such as one that ends with CR alone.
         if lines.0 != b"\r\n" {
             return Err(HeadError::Malformed);
         }
@@ -254,7 +257,7 @@ impl<'a> HttpHead<'a> {
         cut(self.target, b'?').map_or(self.target, |(path, _)| path)
     }
 
-    /// The value of `name` in the query, such as `revision` in `?revision=3`; nothing is decoded.
+    /// The value of `name` in the query, such as `revision` in `?revision=3`, without percent-decoding.
     pub fn query(&self, name: &str) -> Option<&'a str> {
         let (_, mut rest) = cut(self.target, b'?')?;
         while !rest.is_empty() {
@@ -267,7 +270,7 @@ impl<'a> HttpHead<'a> {
         None
     }
 
-    /// Whether each item of the query is one of these arguments with its value, and none comes twice.
+    /// Whether the query has only these arguments, each with a value and at most once.
     pub fn has_only(&self, arguments: &[&str]) -> bool {
         let Some((_, mut rest)) = cut(self.target, b'?') else { return true };
         while !rest.is_empty() {
@@ -281,9 +284,9 @@ impl<'a> HttpHead<'a> {
         true
     }
 
-    /// `Host` without its port.
+    /// `Host` without the port.
     pub fn host_name(&self) -> &'a str {
-        // An IPv6 address has colons of its own, in brackets.
+        // An IPv6 address contains colons, but is in brackets.
         let end = match self.host.bytes().position(|byte| byte == b']') {
             Some(at) => at.saturating_add(1),
             None => self.host.bytes().position(|byte| byte == b':').unwrap_or(self.host.len()),
@@ -304,11 +307,11 @@ fn has_item(mut query: &str, name: &str) -> bool {
     false
 }
 
-/// The lines of a head: each ends with CR LF and has no other control character than tabs.
+/// The lines of a head. Each ends with CR LF and contains no control character but tabs.
 struct Lines<'a>(&'a [u8]);
 
 impl<'a> Lines<'a> {
-    /// The next line; `None` at the empty one.
+    /// The next line; `None` at the empty line.
     fn next(&mut self) -> Option<&'a str> {
         let end = self.0.iter().position(|&byte| matches!(byte, b'\r' | b'\n'))?;
         let (line, rest) = self.0.split_at_checked(end).filter(|(line, _)| !line.is_empty())?;
@@ -317,14 +320,14 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// What is before and behind the first `at`, which is ASCII. The library's own has panics that the optimiser
+/// What comes before and after the first `at`, which must be ASCII. `str::split_once` has panics that the optimiser
 /// does not remove.
 pub(crate) fn cut(text: &str, at: u8) -> Option<(&str, &str)> {
     let place = text.bytes().position(|byte| byte == at)?;
     Some((text.get(..place)?, text.get(place.saturating_add(1)..)?))
 }
 
-/// Without blanks and tabs around it.
+/// Removes blanks and tabs at both ends.
 pub(crate) fn trim(mut text: &str) -> &str {
     while let Some(rest) = text.strip_prefix(' ').or_else(|| text.strip_prefix('\t')) {
         text = rest;
@@ -335,12 +338,12 @@ pub(crate) fn trim(mut text: &str) -> &str {
     text
 }
 
-/// Whether a name may contain it (RFC 9110 section 5.6.2).
+/// Whether a field name may contain this byte (RFC 9110 section 5.6.2).
 fn is_of_token(byte: u8) -> bool {
     byte.is_ascii_alphanumeric() || b"!#$%&'*+-.^_`|~".contains(&byte)
 }
 
-/// Digits alone: no sign, no blanks, no list of equal lengths.
+/// Parses digits alone: no sign, no blanks, no list of equal lengths.
 fn decimal(text: &str) -> Result<u64, HeadError> {
     if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_digit()) {
         return Err(HeadError::Malformed);

@@ -1,7 +1,7 @@
-//! The head of a response, and the frames of a body whose length is not known before its end.
+//! The head of a response, and the chunks of a body whose length is not known in advance.
 //!
-//! Every response ends its connection, forbids framing by other pages and guesses at its type, and, but for the page
-//! for people, to be kept.
+//! Every response closes its connection. It forbids other pages to frame it, browsers to guess its type, and, except
+//! for the page for people, caches to store it.
 
 use core::fmt::{self, Write};
 
@@ -17,37 +17,37 @@ impl StatusCode {
     pub const OK: Self = Self(200);
     /// 201: a configuration was stored.
     pub const CREATED: Self = Self(201);
-    /// 202: it was begun, and its end is shown elsewhere.
+    /// 202: an operation was started; its result is shown elsewhere.
     pub const ACCEPTED: Self = Self(202);
-    /// 304: the client has it already.
+    /// 304: the client has the current version.
     pub const NOT_MODIFIED: Self = Self(304);
     /// 400.
     pub const BAD_REQUEST: Self = Self(400);
-    /// 401: the key is needed, or was wrong.
+    /// 401: the key is missing or wrong.
     pub const UNAUTHORIZED: Self = Self(401);
-    /// 403: not from this page, or without a key at the server.
+    /// 403: from a page of another origin, or the server has no key.
     pub const FORBIDDEN: Self = Self(403);
     /// 404.
     pub const NOT_FOUND: Self = Self(404);
     /// 405, with `Allow`.
     pub const METHOD_NOT_ALLOWED: Self = Self(405);
-    /// 408: it took too long.
+    /// 408: the request took too long.
     pub const TIMEOUT: Self = Self(408);
-    /// 409: not in this state.
+    /// 409: not possible in the current state.
     pub const CONFLICT: Self = Self(409);
-    /// 411: a body without its length.
+    /// 411: the body has no length.
     pub const LENGTH_REQUIRED: Self = Self(411);
     /// 412: `If-Match` names another revision.
     pub const PRECONDITION_FAILED: Self = Self(412);
     /// 413: the body is too long.
     pub const TOO_LARGE: Self = Self(413);
-    /// 415: a body of another type.
+    /// 415: the body has another type.
     pub const UNSUPPORTED_TYPE: Self = Self(415);
     /// 417: an unknown `Expect`.
     pub const EXPECTATION_FAILED: Self = Self(417);
-    /// 421: this server is not that host.
+    /// 421: this server is not the host of the request.
     pub const MISDIRECTED: Self = Self(421);
-    /// 422: the body was understood, and is wrong.
+    /// 422: the body is well-formed, but its content is wrong.
     pub const UNPROCESSABLE: Self = Self(422);
     /// 428: `If-Match` is needed.
     pub const PRECONDITION_REQUIRED: Self = Self(428);
@@ -55,16 +55,16 @@ impl StatusCode {
     pub const TOO_MANY: Self = Self(429);
     /// 431: the head is too long.
     pub const HEAD_TOO_LARGE: Self = Self(431);
-    /// 500: it could not be done, such as for a full disk.
+    /// 500: the operation failed, for example because the disk is full.
     pub const INTERNAL: Self = Self(500);
-    /// 501: this server cannot do that.
+    /// 501: this server does not support the operation.
     pub const NOT_IMPLEMENTED: Self = Self(501);
-    /// 503: no room for another connection or stream, or nothing runs at the moment.
+    /// 503: no room for another connection or stream, or no configuration runs at the moment.
     pub const UNAVAILABLE: Self = Self(503);
-    /// 505: another version than HTTP/1.1.
+    /// 505: the version is not HTTP/1.1.
     pub const VERSION: Self = Self(505);
 
-    /// The usual words for it.
+    /// The usual reason phrase.
     pub const fn reason(self) -> &'static str {
         match self.0 {
             200 => "OK",
@@ -96,13 +96,13 @@ impl StatusCode {
     }
 }
 
-/// The type of a body.
+/// The media type of a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ContentType {
     /// JSON.
     Json,
-    /// A configuration.
+    /// A configuration as TOML.
     Toml,
     /// OpenMetrics.
     Metrics,
@@ -110,7 +110,7 @@ pub enum ContentType {
     Text,
     /// Server-sent events.
     Events,
-    /// A capture.
+    /// A capture (pcapng).
     Capture,
     /// The console.
     Page,
@@ -137,11 +137,11 @@ impl ContentType {
 /// How a client learns where the body ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Length {
-    /// It has this many bytes.
+    /// By its length in bytes.
     Bytes(u64),
-    /// In chunks ([`write_chunk`]).
+    /// By chunked encoding ([`write_chunk`]).
     Chunked,
-    /// It goes on until the connection is closed.
+    /// The body goes on until the connection is closed.
     Endless,
 }
 
@@ -156,27 +156,27 @@ pub struct Response<'a> {
 }
 
 impl<'a> Response<'a> {
-    /// A response without further fields.
+    /// A response without further header fields.
     pub const fn new(status: StatusCode, kind: ContentType, length: Length) -> Self {
         Self { status, kind, length, policy: NOTHING, fields: &[] }
     }
 
-    /// Adds fields. Their values must be text without line ends.
+    /// Adds header fields. Their values must be text without line ends.
     #[must_use]
     pub const fn with(self, fields: &'a [(&'a str, &'a dyn fmt::Display)]) -> Self {
         Self { fields, ..self }
     }
 
-    /// Sets the `Content-Security-Policy`; without it a browser runs and loads nothing.
+    /// Sets the `Content-Security-Policy`. The default lets a browser run and load nothing.
     #[must_use]
     pub const fn with_policy(self, policy: &'a str) -> Self {
         Self { policy, ..self }
     }
 
-    /// Writes the head, up to and with its empty line.
+    /// Writes the head, including the empty line at its end.
     pub fn write(&self, out: &mut impl Write) -> fmt::Result {
         write!(out, "HTTP/1.1 {} {}\r\n", self.status.0, self.status.reason())?;
-        // What the client has already is not described again: its length is not that of this answer.
+        // A 304 does not describe the body that the client has: the length here would be that of this response.
         if self.status != StatusCode::NOT_MODIFIED {
             write!(out, "Content-Type: {}\r\n", self.kind.name())?;
             match self.length {
@@ -198,10 +198,10 @@ impl<'a> Response<'a> {
     }
 }
 
-/// The page for people, a part of the program. A browser keeps it, and asks each time whether it is still the same.
+/// The page for people, part of the program. A browser caches it, and asks each time whether it has changed.
 #[derive(Debug, Clone, Copy)]
 pub struct Page {
-    /// Compressed with gzip.
+    /// The page, compressed with gzip.
     pub bytes: &'static [u8],
     /// Its `Content-Security-Policy`.
     pub policy: &'static str,
@@ -210,8 +210,8 @@ pub struct Page {
 }
 
 impl Page {
-    /// [`StatusCode::OK`], or [`StatusCode::NOT_MODIFIED`] if `If-None-Match` shows that the client has it: then nothing
-    /// follows the head.
+    /// [`StatusCode::OK`], or [`StatusCode::NOT_MODIFIED`] if `If-None-Match` shows that the client has the page. Then
+    /// no body follows the head.
     pub fn status(&self, if_none_match: Option<&str>) -> StatusCode {
         let mut rest = if_none_match.unwrap_or("");
         while !rest.is_empty() {
@@ -225,10 +225,10 @@ impl Page {
         StatusCode::OK
     }
 
-    /// Writes the head of an answer with this status.
+    /// Writes the head of a response with this status.
     pub fn write_head(&self, status: StatusCode, out: &mut impl Write) -> fmt::Result {
         let fields: [(&str, &dyn fmt::Display); 2] = [("ETag", &self.etag), ("Content-Encoding", &"gzip")];
-        // Of a page that the client has, only which one it is.
+        // A 304 has only the `ETag`.
         let fields = if status == StatusCode::NOT_MODIFIED { fields.get(..1) } else { fields.get(..) };
         Response::new(status, ContentType::Page, Length::Bytes(self.bytes.len() as u64))
             .with_policy(self.policy)
@@ -237,13 +237,13 @@ impl Page {
     }
 }
 
-/// The policy of everything that is no page.
+/// The `Content-Security-Policy` of everything but the page.
 const NOTHING: &str = "default-src 'none'; frame-ancestors 'none'";
 
-/// What a client that asked for it gets before it sends its body.
+/// Sent to a client that expects it before it sends its body.
 pub const CONTINUE: &str = "HTTP/1.1 100 Continue\r\n\r\n";
 
-/// Writes a piece of a chunked body. An empty one would end it and is left out.
+/// Writes a chunk of a body. An empty chunk would end the body, so nothing is written for it.
 pub fn write_chunk(out: &mut impl Write, piece: &str) -> fmt::Result {
     match piece.len() {
         0 => Ok(()),

@@ -1,15 +1,14 @@
-//! Configurations that are kept, tried, confirmed and taken back.
+//! Configurations that are stored, tried, confirmed and taken back.
 //!
-//! In: what people ask for, the results of what the driver did, the present. Out: what the driver has to do
-//! next. Knows neither what a configuration contains nor where it is kept: files on a host, cells of flash on a
-//! board.
+//! In: requests of people, the results of the driver's work, the current time. Out: what the driver has to do next.
+//! Does not know what a configuration contains or where it is stored: in files on a host, in flash on a board.
 //!
-//! One revision is *live*: it is marked in the store, and runs after a restart. Another one runs only *on
-//! trial*, until it is confirmed, or its time is over, or it fails. So whatever happens to the store, to the
-//! power or to the person who applied it, what runs in the end is something that was confirmed.
+//! One revision is *live*: it is marked in the store, and runs after a restart. Another revision runs only *on trial*,
+//! until it is confirmed, its time is over, or it fails. Whatever happens to the store, to the power or to the person
+//! who applied it, the revision that runs in the end is a confirmed one.
 //!
-//! The contract is that of the engine: change it, then call [`Revisions::poll_output`] until it returns
-//! [`RevisionOutput::Sleep`]. Each other output is carried out, and its result is reported, before the next call.
+//! The contract is that of the engine: report one change, then call [`Revisions::poll_output`] until it returns
+//! [`RevisionOutput::Sleep`]. The driver executes each other output and reports its result before the next call.
 
 use core::fmt::{self, Write as _};
 
@@ -24,15 +23,15 @@ use crate::response::StatusCode;
 pub const MAX_REVISIONS: usize = 8;
 /// Shortest and longest trial.
 pub const TRIAL: core::ops::RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(3600);
-/// How long to wait before a live revision that did not start is started again: the first time, and at most.
+/// How long to wait before a live revision that did not start is started again: the first pause, and the longest.
 const RETRY: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(10));
 
-/// A configuration that is kept.
+/// A stored configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Revision {
-    /// Its number: higher than that of all before it.
+    /// Its number, higher than those of all revisions before it.
     pub number: u32,
-    /// The beginning of the hash of its contents: two stores may have the same numbers.
+    /// The beginning of the hash of its contents, since two stores may use the same numbers.
     pub digest: u32,
 }
 
@@ -47,7 +46,7 @@ impl fmt::Display for Etag {
 }
 
 impl Etag {
-    /// The revision of an ETag; `None` if it is not exactly the text that is displayed.
+    /// Parses an ETag. `None` if the text is not exactly as displayed.
     pub fn parse(text: &str) -> Option<Revision> {
         let (number, digest) = cut(text.strip_prefix('"')?.strip_suffix('"')?, b'-')?;
         let revision =
@@ -58,10 +57,10 @@ impl Etag {
     }
 }
 
-/// The revision that a change is based on, from `If-Match`: `Some(None)` if that is not one ETag.
+/// The revision that a change is based on, from `If-Match`. `Some(None)` stands for a field that is not one ETag.
 ///
 /// # Errors
-/// `If-Match` is missing, or is no ETag.
+/// `If-Match` is missing, or is not one ETag.
 pub fn base_of(if_match: Option<Option<Revision>>) -> core::result::Result<Revision, Refusal> {
     match if_match {
         Some(Some(base)) => Ok(base),
@@ -76,18 +75,18 @@ pub fn base_of(if_match: Option<Option<Revision>>) -> core::result::Result<Revis
     }
 }
 
-/// What a store holds at the start.
+/// What the store holds at the start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stored {
     /// All revisions, the oldest first.
     pub kept: Vec<Revision, MAX_REVISIONS>,
-    /// Number of the live one.
+    /// Number of the live revision.
     pub live: u32,
-    /// Number of the one that was live before.
+    /// Number of the revision that was live before.
     pub previous: Option<u32>,
 }
 
-/// The revisions, and what happens to them.
+/// The revisions and their state.
 #[derive(Debug, Clone)]
 pub struct Revisions {
     kept: Vec<Revision, MAX_REVISIONS>,
@@ -96,47 +95,47 @@ pub struct Revisions {
     waiting: Option<u32>,
     phase: RevisionPhase,
     last: Option<(u32, Ended)>,
-    /// The phase's output was not returned yet.
+    /// The output of the phase has not been returned yet.
     is_due: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum RevisionPhase {
-    /// The live one runs.
+    /// The live revision runs.
     Live,
-    /// One is being written.
+    /// A revision is being written; then `forget` is removed.
     Storing { revision: Revision, forget: Option<u32> },
-    /// One is being started for a trial of this length.
+    /// A revision is being started for a trial of this length.
     StartingTrial { number: u32, trial: Duration },
-    /// It runs until then.
+    /// A revision is on trial until then.
     Trial { number: u32, until: Instant },
-    /// It was confirmed and is being marked.
+    /// A revision on trial was confirmed and is being marked as live.
     Confirming { number: u32, until: Instant },
-    /// The one that was live before is being started.
+    /// The revision that was live before is being started.
     Returning { number: u32 },
-    /// It runs and is being marked.
+    /// It runs and is being marked as live.
     Marking { number: u32 },
-    /// The live one is being started.
+    /// The live revision is being started.
     StartingLive { wait: Duration },
-    /// The live one did not start. Nothing runs until then.
+    /// The live revision did not start. Nothing runs until the next attempt.
     Down { until: Instant, wait: Duration },
 }
 
-/// How the newest trial ended.
+/// How a trial ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ended {
-    /// It was confirmed.
+    /// A person confirmed it.
     Confirmed,
     /// Nobody confirmed it in time.
     NotConfirmed,
-    /// Somebody took it back.
+    /// A person took it back.
     TakenBack,
-    /// It could not be started, or ended by itself.
+    /// The revision could not be started, or ended by itself.
     Failed,
 }
 
 impl Ended {
-    /// One word for people and statistics.
+    /// A word for people and statistics.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Confirmed => "confirmed",
@@ -150,64 +149,64 @@ impl Ended {
 /// What the driver has to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RevisionOutput {
-    /// Keep the configuration that was given with [`Revisions::put`], then remove `forget`. Report
+    /// Store the configuration that was given with [`Revisions::put`], then remove `forget`. Report
     /// [`Result::Stored`].
     Store {
-        /// Its number and digest.
+        /// Number and digest of the configuration.
         revision: Revision,
-        /// One that is not kept any longer.
+        /// A revision that is to be removed.
         forget: Option<u32>,
     },
-    /// Bring the safe values out, end what runs, and start this one. Report [`Result::Started`].
+    /// Output the safe values, end what runs, and start this revision. Report [`Result::Started`].
     Run {
-        /// Its number.
+        /// Number of the revision.
         number: u32,
     },
-    /// Mark this one as live, and the other as the one before, in one step that a power cut does not divide.
-    /// Report [`Result::Marked`].
+    /// Mark one revision as live and the other as the one before, atomically even if the power fails. Report
+    /// [`Result::Marked`].
     Mark {
-        /// Number of the live one.
+        /// Number of the live revision.
         live: u32,
-        /// Number of the one before.
+        /// Number of the revision before.
         previous: u32,
     },
-    /// Nothing until then.
+    /// Nothing to do until then.
     Sleep {
         /// When to call [`Revisions::poll_output`] again.
         until: Instant,
     },
 }
 
-/// What came of an [`RevisionOutput`]; `true` if it was done, `false` if nothing was changed.
+/// The result of a [`RevisionOutput`]: `true` if it was done, `false` if nothing was changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Result {
-    /// Of [`RevisionOutput::Store`].
+    /// The result of [`RevisionOutput::Store`].
     Stored(bool),
-    /// Of [`RevisionOutput::Run`]; `false`: nothing runs now.
+    /// The result of [`RevisionOutput::Run`]. After `false` nothing runs.
     Started(bool),
-    /// Of [`RevisionOutput::Mark`].
+    /// The result of [`RevisionOutput::Mark`].
     Marked(bool),
-    /// What ran on trial ended by itself.
+    /// The revision on trial ended by itself.
     Ended,
 }
 
-/// Why something is not done.
+/// Why a request is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refused {
-    /// Something else is being done, or nothing runs at the moment.
+    /// Another operation is in progress, or nothing runs at the moment.
     Busy,
     /// A revision is on trial: confirm it or take it back first.
     OnTrial,
     /// No revision is on trial.
     NotOnTrial,
-    /// The change is based on another revision than the newest: this one.
+    /// The change is not based on the newest revision, which is this one.
     Changed(Revision),
-    /// No stored revision waits, and none was named.
+    /// No number was given, and no stored revision waits to be applied.
     NothingWaits,
     /// There is no such revision.
     Unknown,
-    /// It runs already.
+    /// The revision runs already.
     Runs,
     /// The trial is shorter or longer than allowed.
     Trial,
@@ -251,8 +250,8 @@ impl fmt::Display for Refused {
 }
 
 impl Revisions {
-    /// With what a store holds. The live one runs, or is about to be started by the driver; `None` if the
-    /// store does not hold the live one.
+    /// Starts with what the store holds. The live revision runs, or is about to be started by the driver. `None` if the
+    /// store does not hold the live revision.
     pub fn new(stored: Stored) -> Option<Self> {
         let Stored { kept, live, previous } = stored;
         let has = |number: u32| kept.iter().any(|revision| revision.number == number);
@@ -269,8 +268,9 @@ impl Revisions {
         })
     }
 
-    /// Continues a trial that a restart of the whole program has begun: `number` runs, until then. `false` if it
-    /// is not kept, or live.
+    /// Continues a trial that began before a restart of the program: `number` runs until `until`. Returns `false` if
+    /// that
+    /// revision is not stored, or is the live one.
     pub fn resume_trial(&mut self, number: u32, until: Instant) -> bool {
         let is_other = number != self.live && self.revision(number).is_some();
         if is_other {
@@ -279,39 +279,39 @@ impl Revisions {
         is_other
     }
 
-    /// The newest trial that ended before a restart of the whole program, and how.
+    /// Restores the last trial that ended before a restart of the program, and how it ended.
     pub fn resume_last(&mut self, last: Option<(u32, Ended)>) {
         self.last = last;
     }
 
-    /// Drops the revisions that are kept no longer; the live one and the one before it stay.
+    /// Removes the revisions that are no longer stored, except the live one and the one before it.
     pub fn keep_only(&mut self, is_kept: impl Fn(u32) -> bool) {
         let needed = [Some(self.live), self.previous];
         self.kept.retain(|kept| needed.contains(&Some(kept.number)) || is_kept(kept.number));
         self.waiting = self.waiting.filter(|number| is_kept(*number));
     }
 
-    /// All that are kept, the oldest first.
+    /// All stored revisions, the oldest first.
     pub fn kept(&self) -> &[Revision] {
         &self.kept
     }
 
-    /// The one that runs after a restart.
+    /// The revision that runs after a restart.
     pub fn live(&self) -> u32 {
         self.live
     }
 
-    /// The one that was live before.
+    /// The revision that was live before.
     pub fn previous(&self) -> Option<u32> {
         self.previous
     }
 
-    /// The one that was stored and not applied.
+    /// The revision that was stored but not applied yet.
     pub fn waiting(&self) -> Option<u32> {
         self.waiting
     }
 
-    /// The one that runs; `None` while none does.
+    /// The revision that runs; `None` while none does.
     pub fn running(&self) -> Option<u32> {
         match self.phase {
             RevisionPhase::Live | RevisionPhase::Storing { .. } => Some(self.live),
@@ -322,7 +322,7 @@ impl Revisions {
         }
     }
 
-    /// The one on trial, and the end of the trial.
+    /// The revision on trial, and the end of the trial.
     pub fn trial(&self) -> Option<(u32, Instant)> {
         match self.phase {
             RevisionPhase::Trial { number, until } | RevisionPhase::Confirming { number, until } => {
@@ -332,23 +332,23 @@ impl Revisions {
         }
     }
 
-    /// The newest trial that has ended, and how.
+    /// The last trial that ended, and how.
     pub fn last(&self) -> Option<(u32, Ended)> {
         self.last
     }
 
-    /// The revision that a change has to be based on: the one that waits, or else the live one.
+    /// The revision that a change has to be based on: the waiting one if there is one, otherwise the live one.
     pub fn base(&self) -> Option<Revision> {
         self.revision(self.waiting.unwrap_or(self.live))
     }
 
-    /// The revision of this number.
+    /// The revision with this number.
     pub fn revision(&self, number: u32) -> Option<Revision> {
         self.kept.iter().copied().find(|revision| revision.number == number)
     }
 
-    /// Somebody stores a configuration that was made from `base`. Returns its number; it is kept once the
-    /// store has succeeded.
+    /// A person stores a configuration that was made from `base`. Returns its number. It is kept once the store has
+    /// succeeded.
     pub fn put(&mut self, base: Revision, digest: u32) -> core::result::Result<u32, Refused> {
         self.must_rest()?;
         match self.base() {
@@ -366,7 +366,7 @@ impl Revisions {
         Ok(revision.number)
     }
 
-    /// Somebody applies a revision, or the one that waits. Returns its number.
+    /// A person applies a revision, by default the waiting one. Returns its number.
     pub fn apply(&mut self, number: Option<u32>, trial: Duration) -> core::result::Result<u32, Refused> {
         self.must_rest()?;
         if !TRIAL.contains(&trial) {
@@ -386,7 +386,7 @@ impl Revisions {
         Ok(number)
     }
 
-    /// Somebody confirms what runs on trial. Returns its number; it is live once it is marked.
+    /// A person confirms the revision on trial. Returns its number. It is live once it is marked.
     pub fn confirm(&mut self, now: Instant) -> core::result::Result<u32, Refused> {
         match self.phase {
             RevisionPhase::Trial { number, until } if now < until => {
@@ -398,8 +398,8 @@ impl Revisions {
         }
     }
 
-    /// Somebody takes back what runs on trial, or else what is live. Returns the number of the one that runs
-    /// next.
+    /// A person takes back the revision on trial, or, without a trial, the live one. Returns the number of the revision
+    /// that runs next.
     pub fn roll_back(&mut self) -> core::result::Result<u32, Refused> {
         match (self.phase, self.previous) {
             (RevisionPhase::Trial { number, .. }, _) => {
@@ -415,7 +415,7 @@ impl Revisions {
         }
     }
 
-    /// Reports what came of an output. Anything else than the result that is awaited is ignored.
+    /// Reports the result of an output. Results of other outputs than the current one are ignored.
     pub fn handle(&mut self, now: Instant, result: Result) {
         if self.is_due && result != Result::Ended {
             return;
@@ -424,7 +424,7 @@ impl Revisions {
             (RevisionPhase::Storing { revision, forget }, Result::Stored(is_done)) => {
                 if is_done {
                     self.kept.retain(|kept| Some(kept.number) != forget);
-                    // `forget` made room.
+                    // Cannot fail: removing `forget` made room.
                     let _ = self.kept.push(revision);
                     self.waiting = Some(revision.number);
                 }
@@ -455,7 +455,7 @@ impl Revisions {
                 (self.previous, self.live) = (Some(self.live), number);
                 self.enter(RevisionPhase::Live);
             }
-            // What runs must be what runs after a restart.
+            // The revision that runs must be the one that runs after a restart.
             (RevisionPhase::Marking { number }, Result::Marked(false)) => {
                 self.end_trial(number, Ended::Failed)
             }
@@ -467,7 +467,7 @@ impl Revisions {
         }
     }
 
-    /// The next thing for the driver to do. Call it again until it is [`RevisionOutput::Sleep`].
+    /// The next task for the driver. Call it again until it returns [`RevisionOutput::Sleep`].
     pub fn poll_output(&mut self, now: Instant) -> RevisionOutput {
         match self.phase {
             RevisionPhase::Trial { number, until } if now >= until => {
@@ -500,7 +500,7 @@ impl Revisions {
         }
     }
 
-    /// Whether something new may begin.
+    /// Refuses unless the live revision runs and nothing is in progress.
     fn must_rest(&self) -> core::result::Result<(), Refused> {
         match self.phase {
             RevisionPhase::Live => Ok(()),

@@ -1,14 +1,14 @@
-//! The table of endpoints: which method and path is which operation, who serves it, and what it asks for.
+//! The table of endpoints: the operation of each method and path, which program serves it, and what it requires.
 
 use crate::request::{HttpHead, Method, cut, trim};
 
-/// What a request asks for (docs/api.md).
+/// The operation that a request asks for (docs/api.md).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ApiOperation {
     /// The page for people.
     Page,
-    /// Who and what this is.
+    /// What this server is.
     Info,
     /// State and counters.
     Status,
@@ -16,23 +16,23 @@ pub enum ApiOperation {
     Values,
     /// State, counters and latencies as OpenMetrics.
     Metrics,
-    /// The configuration: the running one, or another that is kept.
+    /// The configuration: the running one, or another stored one.
     Config,
-    /// The revisions that are kept, and which is running.
+    /// The stored revisions, and which one runs.
     Revisions,
     /// Server-sent events.
     Stream,
-    /// Frames as a capture (pcapng) that goes on.
+    /// Frames as an endless capture (pcapng).
     Capture,
     /// The JSON Schema of configurations.
     Schema,
-    /// The CAN database of what runs.
+    /// The CAN database of the running configuration.
     ExportDbc,
-    /// The dissector for Wireshark of what runs.
+    /// The Wireshark dissector of the running configuration.
     ExportLua,
-    /// The table of variables of what runs.
+    /// The table of variables of the running configuration.
     ExportMap,
-    /// What is wrong, in words.
+    /// What is wrong, as text for people.
     Doctor,
     /// The newest lines of the log.
     Log,
@@ -44,41 +44,41 @@ pub enum ApiOperation {
     Check,
     /// Store a configuration.
     PutConfig,
-    /// Run a stored configuration, and return to the one before unless it is confirmed.
+    /// Run a stored configuration on trial: unless it is confirmed, the one before returns.
     Apply,
-    /// Keep what is running.
+    /// Make the configuration on trial the live one.
     Confirm,
-    /// Return to the configuration before.
+    /// Return to the previous configuration.
     Rollback,
-    /// Show which one this is, among several.
+    /// Show which of several gateways this is.
     Identify,
     /// An operation of the simulated controller's pendant.
     Pendant,
-    /// Take this key, after a press of the button.
+    /// Set the key, after a press of the button.
     Claim,
-    /// The firmware that runs, the one that is being received, and a trial.
+    /// The firmware that runs, the one that is being received, and the trial.
     Update,
-    /// Take a piece of a firmware.
+    /// Receive a piece of a firmware.
     PutUpdate,
-    /// Run the firmware that was received, and return to the one before unless it is confirmed.
+    /// Run the received firmware on trial: unless it is confirmed, the one before returns.
     TryUpdate,
     /// Keep the firmware that is on trial.
     ConfirmUpdate,
-    /// Return to the firmware before.
+    /// Return to the previous firmware.
     EndUpdate,
-    /// How the edge node does.
+    /// State of the edge node.
     Edge,
-    /// Keep settings for the edge node.
+    /// Store settings for the edge node.
     PutEdge,
 }
 
 impl ApiOperation {
-    /// Whether its answer goes on until the client leaves.
+    /// Whether its response goes on until the client disconnects.
     pub const fn is_endless(self) -> bool {
         matches!(self, Self::Stream | Self::Capture)
     }
 
-    /// The arguments that its query may have.
+    /// The arguments that may be in its query.
     pub const fn arguments(self) -> &'static [&'static str] {
         match self {
             Self::Config => &["revision"],
@@ -94,7 +94,7 @@ impl ApiOperation {
     }
 }
 
-/// What a program serves.
+/// The programs that have endpoints.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Served {
     /// The gateway on a host.
@@ -105,7 +105,7 @@ pub enum Served {
     Board,
 }
 
-/// What a request needs before it is carried out.
+/// What a request needs before it is executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
     /// Nothing.
@@ -119,7 +119,7 @@ pub enum Access {
 /// The type of a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BodyType {
-    /// There is none.
+    /// No body.
     None,
     /// `application/toml`.
     Toml,
@@ -140,7 +140,7 @@ impl BodyType {
         }
     }
 
-    /// Whether `Content-Type` names it; parameters such as a charset are not looked at.
+    /// Whether `Content-Type` names this type; parameters such as a charset are ignored.
     pub fn is(self, content_type: &str) -> bool {
         let name = cut(content_type, b';').map_or(content_type, |(name, _)| name);
         trim(name).eq_ignore_ascii_case(self.name())
@@ -153,15 +153,15 @@ impl BodyType {
 pub struct Route {
     /// The path.
     pub path: &'static str,
-    /// The method; [`Method::Get`] stands for `HEAD` too, but for answers that go on.
+    /// The method; [`Method::Get`] also stands for `HEAD`, except for endless responses.
     pub method: Method,
-    /// What is done.
+    /// The operation.
     pub operation: ApiOperation,
-    /// What it needs.
+    /// What the request needs.
     pub access: Access,
-    /// What its body is.
+    /// The type of the body.
     pub body: BodyType,
-    /// Who serves it.
+    /// Which programs serve it.
     pub served: &'static [Served],
 }
 
@@ -199,7 +199,7 @@ pub const ROUTES: &[Route] = &[
     post("/api/v1/update/back", ApiOperation::EndUpdate, GATEWAYS),
     get("/api/v1/edge", ApiOperation::Edge, GATEWAYS),
     put("/api/v1/edge", ApiOperation::PutEdge, BodyType::Image, GATEWAYS),
-    // There is no key to be shown yet; the button stands for it.
+    // The board has no key yet that a client could show; the press of the button takes its place.
     Route { access: Access::Open, ..post("/api/v1/claim", ApiOperation::Claim, BOARD) },
 ];
 
@@ -229,16 +229,16 @@ const fn put(
     Route { path, method: Method::Put, operation, access: Access::Write, body, served }
 }
 
-/// Why there is no route.
+/// Why no route was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RouteError {
     /// There is no such path.
     NotFound,
-    /// The path has other methods; this is the value of `Allow`.
+    /// The path exists, but not with this method; this is the value of `Allow`.
     Method(&'static str),
 }
 
-/// The route of a request.
+/// Finds the route of a request.
 pub fn find(head: &HttpHead<'_>, served: Served) -> Result<&'static Route, RouteError> {
     let path = head.path();
     let here = || ROUTES.iter().filter(move |route| route.path == path && route.served.contains(&served));
@@ -262,7 +262,7 @@ pub fn find(head: &HttpHead<'_>, served: Served) -> Result<&'static Route, Route
 }
 
 impl Route {
-    /// Whether a request with this method is for it.
+    /// Whether the endpoint takes this method.
     pub fn takes(&self, method: Method) -> bool {
         self.method == method
             || method == Method::Head && self.method == Method::Get && !self.operation.is_endless()
@@ -325,7 +325,7 @@ mod tests {
     fn whatever_changes_something_is_no_get_and_needs_the_key() {
         for route in ROUTES {
             let reads = route.method == Method::Get || route.operation == ApiOperation::Check;
-            // Without a key there is none to be shown.
+            // A board has no key yet when it is claimed.
             let reads = reads || route.operation == ApiOperation::Claim;
             assert_eq!(route.access == Access::Write, !reads, "{}", route.path);
             assert_eq!(route.body == BodyType::None, route.method == Method::Get, "{}", route.path);
