@@ -1,6 +1,6 @@
-//! Bytes that are written into a buffer of the caller's, or only counted.
+//! Writes bytes into a buffer of the caller, or only counts them.
 //!
-//! What does not fit is counted all the same, so one function both measures and writes.
+//! Bytes that do not fit are counted too, so one function both measures and writes.
 
 #[derive(Debug)]
 pub(crate) struct ByteWriter<'b> {
@@ -9,7 +9,7 @@ pub(crate) struct ByteWriter<'b> {
 }
 
 impl<'b> ByteWriter<'b> {
-    /// Writes from the beginning of the buffer on.
+    /// Writes from the beginning of the buffer.
     pub(crate) fn new(buf: &'b mut [u8]) -> Self {
         Self { buf, len: 0 }
     }
@@ -33,12 +33,12 @@ impl<'b> ByteWriter<'b> {
         self.put(&[byte]);
     }
 
-    /// Number of bytes so far, also of those that did not fit.
+    /// Number of bytes so far, including those that did not fit.
     pub(crate) const fn len(&self) -> usize {
         self.len
     }
 
-    /// What was written; `None` if it did not fit.
+    /// The bytes that were written; `None` if they did not all fit.
     pub(crate) fn finish(self) -> Option<&'b [u8]> {
         let Self { buf, len } = self;
         buf.get(..len)

@@ -1,20 +1,20 @@
-//! UTC, once somebody has told it.
+//! UTC, once the driver has reported it.
 
 use proto_core::time::Instant;
 
-/// Milliseconds of UTC for instants.
+/// Converts instants to UTC in milliseconds.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct UtcClock {
     known: Option<(Instant, u64)>,
 }
 
 impl UtcClock {
-    /// Nobody has told it yet.
+    /// A clock that does not know UTC.
     pub(crate) const fn unknown() -> Self {
         Self { known: None }
     }
 
-    /// It is `utc_ms` at this instant. True if it was not known before.
+    /// Sets UTC to `utc_ms` at this instant. Returns `true` if UTC was unknown before.
     pub(crate) fn set(&mut self, at: Instant, utc_ms: u64) -> bool {
         self.known.replace((at, utc_ms)).is_none()
     }
@@ -23,7 +23,7 @@ impl UtcClock {
         self.known.is_some()
     }
 
-    /// The milliseconds since 1970 at an instant; while UTC is not known, since the instant 0.
+    /// The milliseconds since 1970 at an instant; while UTC is unknown, those since [`Instant::ZERO`].
     pub(crate) fn at(&self, instant: Instant) -> u64 {
         let ms = |from: Instant, to: Instant| to.saturating_since(from).as_millis();
         match self.known {

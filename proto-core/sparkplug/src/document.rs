@@ -1,8 +1,9 @@
-//! The settings of a board's edge node, as the bytes that are sent to it and that it keeps (docs/fleet.md section 6).
+//! The settings of a board's edge node, as the bytes that a client sends and the board stores (docs/fleet.md section
+//! 6).
 //!
-//! In: settings, or bytes. Out: bytes, or settings; bytes that are not exactly what is written here are refused as a
-//! whole. Numbers are little-endian, texts have their length before them.
-//!
+//! In: settings, or bytes. Out: bytes, or settings. Bytes that [`NodeDocument::encode`] would not write are refused as
+//! a
+//! whole. Numbers are little-endian; texts follow their length.
 //! ```text
 //! "RGWE" 1 0                                      tells nothing
 //! "RGWE" 1 1 host port client_id login keep_alive_s group node primary_host
@@ -18,70 +19,70 @@ use crate::gateway::PublishRule;
 use crate::node::{Credential, Settings};
 use crate::topic::{Id, IdError};
 
-/// The most bytes of a document.
+/// The longest document in bytes.
 pub const MAX_DOCUMENT: usize = 3 * 1024;
-/// The longest name of a host, in bytes.
+/// The longest host name in bytes.
 pub const MAX_HOST: usize = 128;
-/// The most rules, and the most ranges of values.
+/// Maximum number of rules, and of ranges of values.
 pub const MAX_RULES: usize = 64;
 
 /// The name or address of a host.
 pub type Host = String<MAX_HOST>;
 
-/// What a board's edge node is to tell, and where.
+/// What the edge node of a board publishes, and to which broker.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NodeDocument {
-    /// The broker's name or IPv4 address.
+    /// The name or IPv4 address of the broker.
     pub host: Host,
-    /// Its TCP port.
+    /// The TCP port of the broker.
     pub port: u16,
-    /// The node's names.
+    /// The names of the node, and its MQTT settings.
     pub settings: Settings,
-    /// How often the gateway is looked at: 100 ms to an hour, as all times here.
+    /// The time between two samples of the gateway: 100 ms to an hour, like all times here.
     pub sample: Duration,
-    /// The least time between two values of a variable or a state.
+    /// The shortest time between two values of a variable or a state.
     pub interval: Duration,
-    /// Same, for counters.
+    /// The shortest time between two values of a counter.
     pub counter_interval: Duration,
-    /// The name or IPv4 address of a server of SNTP, and its UDP port; `None`: UTC stays unknown.
+    /// The name or IPv4 address of an SNTP server, and its UDP port. `None`: UTC stays unknown.
     pub time_server: Option<(Host, u16)>,
-    /// Variables of the controller that are told beside those that field ports send.
+    /// Variables of the controller that are published in addition to those that field ports send.
     pub values: Vec<VarRange, MAX_RULES>,
-    /// Exceptions.
+    /// Rules for single variables.
     pub rules: Vec<PublishRule, MAX_RULES>,
 }
 
-/// Why bytes are no document, or settings cannot be one.
+/// Why bytes are no valid document, or settings cannot be written as one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum DocumentError {
-    /// It does not begin as one.
+    /// The document does not begin with the magic bytes.
     Magic,
-    /// It has another version.
+    /// The document has another version.
     Version {
-        /// Its version; 1 is read.
+        /// The version; only 1 can be read.
         found: u8,
     },
-    /// It has more bytes than [`MAX_DOCUMENT`].
+    /// The document is longer than [`MAX_DOCUMENT`].
     Long {
-        /// Its bytes.
+        /// Its length in bytes.
         len: usize,
     },
     /// It is cut off.
     Short,
-    /// There are bytes behind it.
+    /// There are bytes after the end.
     Behind {
         /// Their number.
         count: usize,
     },
-    /// What stands here is none of what may stand here.
+    /// A value is not allowed.
     Value {
-        /// What it is of.
+        /// What the value is for.
         of: &'static str,
     },
     /// A name cannot be part of a topic.
     Name {
-        /// What it is of.
+        /// What the name is for.
         of: &'static str,
         /// What is wrong with it.
         error: IdError,
@@ -89,7 +90,7 @@ pub enum DocumentError {
 }
 
 impl NodeDocument {
-    /// Settings that are not known yet; all bytes are zero.
+    /// Settings that are not known yet, with all bytes zero.
     pub const fn empty() -> Self {
         Self {
             host: String::new(),
@@ -104,10 +105,10 @@ impl NodeDocument {
         }
     }
 
-    /// Reads a document into this place. Returns false if it says that nothing is told.
+    /// Reads a document into `self`. Returns `false` if it says that nothing is published.
     ///
     /// # Errors
-    /// If it is none; the place is of no use then.
+    /// If the bytes are no valid document. The contents of `self` are invalid then.
     pub fn decode(&mut self, bytes: &[u8]) -> Result<bool, DocumentError> {
         if bytes.len() > MAX_DOCUMENT {
             return Err(DocumentError::Long { len: bytes.len() });
@@ -176,7 +177,7 @@ impl NodeDocument {
         Ok(())
     }
 
-    /// Writes it into `buf`, which has [`MAX_DOCUMENT`] bytes, and returns what was written.
+    /// Writes the document into `buf`, which must have [`MAX_DOCUMENT`] bytes, and returns the written part.
     pub fn encode<'b>(&self, buf: &'b mut [u8]) -> Result<&'b [u8], DocumentError> {
         let mut out = ByteWriter::new(buf);
         begin(&mut out, true);
@@ -220,13 +221,13 @@ impl NodeDocument {
         }
         let len = out.len();
         let bytes = out.finish().ok_or(DocumentError::Long { len })?;
-        // What a board would refuse is never sent.
+        // Reads the result back, so that nothing is sent that a board would refuse.
         Self::empty().decode(bytes)?;
         Ok(bytes)
     }
 }
 
-/// The document that says that nothing is told.
+/// The document that says that nothing is published.
 pub const OFF: [u8; 6] = [b'R', b'G', b'W', b'E', VERSION, 0];
 
 fn begin(out: &mut ByteWriter<'_>, tells: bool) {
@@ -235,7 +236,7 @@ fn begin(out: &mut ByteWriter<'_>, tells: bool) {
 }
 
 fn text(out: &mut ByteWriter<'_>, text: &str) {
-    // The longest text of all has fewer; a longer one would be refused by its reader.
+    // The longest allowed text fits in a byte. A longer one would be refused when it is read.
     out.byte(u8::try_from(text.len()).unwrap_or(u8::MAX));
     out.put(text.as_bytes());
 }
@@ -250,7 +251,7 @@ fn range(out: &mut ByteWriter<'_>, range: VarRange) {
     out.put(&[ordinal(range.iter().next()), ordinal(range.iter().last())]);
 }
 
-/// Bytes that are being read.
+/// A reader of the bytes of a document.
 struct From<'a> {
     rest: &'a [u8],
 }
@@ -281,7 +282,7 @@ impl<'a> From<'a> {
         core::str::from_utf8(text).map_err(|_| DocumentError::Value { of })
     }
 
-    /// A text of MQTT, which may be empty.
+    /// A text for MQTT; it may be empty.
     fn text(&mut self, of: &'static str) -> Result<Credential, DocumentError> {
         let text = self.str(of)?;
         Credential::new(text).filter(|_| !text.contains('\0')).ok_or(DocumentError::Value { of })
@@ -298,7 +299,7 @@ impl<'a> From<'a> {
         Id::new(self.str(of)?).map_err(|error| DocumentError::Name { of, error })
     }
 
-    /// A name or an IPv4 address: a board has no other.
+    /// A name or an IPv4 address; a board does not support IPv6.
     fn host(&mut self, of: &'static str) -> Result<Host, DocumentError> {
         let host = self.str(of)?;
         let is_known = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_');

@@ -10,7 +10,7 @@ fn of(name: &str) -> VarRange {
     VarRange::parse(name).unwrap()
 }
 
-/// A document with everything in it.
+/// A document that uses every field.
 pub(crate) fn full() -> NodeDocument {
     let mut settings = Settings::new(id("hall 1"), id("press 4"));
     settings.login = Some((Credential::new("press").unwrap(), Credential::new("cold steel").unwrap()));
@@ -55,7 +55,7 @@ fn what_is_written_is_read() {
     assert_eq!(read(&OFF), Ok(None));
 }
 
-/// A board keeps these bytes over updates: don't change them, add a version.
+/// Boards store these bytes across updates: don't change them, add a version.
 #[test]
 fn version_1_has_these_bytes() {
     let mut small = full();

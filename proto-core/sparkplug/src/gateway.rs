@@ -1,8 +1,8 @@
-//! What a gateway tells: a [`Catalog`] of its configuration, and samples of its [`Status`].
+//! What a gateway publishes: a [`Catalog`] of its configuration, and samples of its [`Status`].
 //!
-//! In: a configuration, and a status for each sample. Out: metrics and values. The node has the gateway's own health,
-//! its links, the controller's states, and the controller's variables that field ports send or that are asked for.
-//! Each field port is a device, which is alive while the port works, with the variables that it writes.
+//! In: a configuration, and a status for each sample. Out: metrics and values. The node has the health of the gateway,
+//! its links, the states of the controller, and those variables of the controller that field ports send or the settings
+//! name. Each field port is a device with the variables that it writes. The device is alive while the port works.
 
 use core::ops::Range;
 
@@ -19,40 +19,40 @@ use crate::node::NodeCounters;
 use crate::topic::MAX_ID;
 use crate::value::{DataType, Value};
 
-/// The rule of what has none.
+/// Stands for no rule.
 const NO_RULE: u8 = u8::MAX;
 
-/// Most links of a gateway.
+/// Maximum number of links of a gateway.
 const MAX_LINKS: usize = 16;
 
-/// A controller's value that is older than this is unknown.
+/// A value of the controller that is older than this is published as unknown.
 pub const MAX_AGE: Duration = Duration::from_secs(5);
 
-/// When changes are told, and what is told in addition.
+/// When changes are published, and which variables are published in addition.
 #[derive(Debug, Clone, Copy)]
 pub struct Rates<'c> {
-    /// The least time between two values of a variable or a state.
+    /// The shortest time between two values of a variable or a state.
     pub min_interval: Duration,
-    /// Same, for counters and the time since the start, which always change.
+    /// The shortest time between two values of a counter or of the uptime, which always change.
     pub counter_interval: Duration,
-    /// The last one that has a variable counts for it.
+    /// Rules for single variables. If several contain a variable, the last one counts.
     pub rules: &'c [PublishRule],
-    /// Variables of the controller that are told though no port sends them.
+    /// Variables of the controller that are published although no port sends them.
     pub values: &'c [VarRange],
 }
 
-/// How some variables are told.
+/// How some variables are published.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PublishRule {
     /// The variables.
     pub vars: VarRange,
-    /// A number is told when it is further than this from the last one told.
+    /// A number is published if it differs by more than this from the last published one.
     pub dead_band: f64,
-    /// The least time between two; `None`: as for all.
+    /// The shortest time between two values; `None`: as for all variables.
     pub min_interval: Option<Duration>,
 }
 
-/// What a gateway can tell.
+/// The catalog of a gateway.
 #[derive(Debug, Clone)]
 pub struct GatewayCatalog<'c, const METRICS: usize> {
     rates: Rates<'c>,
@@ -60,13 +60,13 @@ pub struct GatewayCatalog<'c, const METRICS: usize> {
     ports: Vec<NodeDevice, MAX_PORTS>,
     links: Vec<DeviceName, MAX_LINKS>,
     items: Vec<MetricItem, METRICS>,
-    /// Where the items of the node and of each port begin, and where the last ones end.
+    /// Where the items of the node and of each port begin; the last entry is the end.
     starts: Vec<usize, { MAX_PORTS + 2 }>,
 }
 
 type DeviceName = String<MAX_ID>;
 
-/// What is told, and the number of the rule for it.
+/// The source of a metric, and the number of its rule.
 #[derive(Debug, Clone, Copy)]
 struct MetricItem {
     item: MetricSource,
@@ -76,9 +76,9 @@ struct MetricItem {
 
 #[derive(Debug, Clone)]
 struct NodeDevice {
-    /// Its index in the configuration.
+    /// Index of the port in the configuration.
     index: u8,
-    /// Its name, as a part of a topic.
+    /// Name of the port, as a part of a topic.
     device: DeviceName,
 }
 
@@ -90,9 +90,9 @@ enum MetricSource {
     Sleeps,
     Lost,
     Refused,
-    /// Of a port, by its number among the devices.
+    /// Whether a port works, by its number among the devices.
     Alive(u8),
-    /// Of a link, by its number.
+    /// The state of a link, by its number.
     Link(u8),
     Mode,
     Robot,
@@ -112,8 +112,9 @@ enum MetricSource {
 pub struct NoRoom;
 
 impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
-    /// The catalog of a gateway that runs this configuration. `status` is of that gateway, at any time; `version`
-    /// is that of its program.
+    /// The catalog of a gateway that runs this configuration. `status` is from that gateway, at any time; `version` is
+    /// the
+    /// version of the program.
     ///
     /// # Errors
     /// If there are more metrics than there is room for.
@@ -190,8 +191,8 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         Ok(catalog)
     }
 
-    /// Puts all values of the gateway into `values`, by their places, and returns the ports that work: bit n is the
-    /// nth device. `uptime` and `node` are the program's.
+    /// Writes all values of the gateway into `values`, by their places. Returns the ports that work: bit n is device n.
+    /// `uptime` and `node` come from the program.
     pub fn sample(
         &self,
         status: Status<'_>,
@@ -203,7 +204,7 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         self.alive(status)
     }
 
-    /// The ports that work: bit n is the nth device.
+    /// The ports that work: bit n is device n.
     pub fn alive(&self, status: Status<'_>) -> u32 {
         let mut alive = 0_u32;
         for port in status.ports().filter(|port| port.state == PortState::Working) {
@@ -213,8 +214,8 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         alive
     }
 
-    /// Same as [`Self::sample`] for some of the places, so that a driver can let others run in between. `values` are
-    /// those of the part.
+    /// As [`Self::sample`], for a range of places, so that a driver can run other tasks in between. `values` holds only
+    /// the values of that range.
     pub fn sample_part(
         &self,
         status: Status<'_>,
@@ -269,7 +270,7 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
                         let is_of_now = |age| var.direction() == Direction::Input || age <= MAX_AGE;
                         known.filter(|known| is_of_now(known.age)).map(|known| value_of(known.value))
                     }
-                    // Set below, if it is known.
+                    // Set below if the bit is known.
                     MetricSource::Bit(..) => None,
                 };
             }
@@ -291,12 +292,12 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         }
     }
 
-    /// The number of metrics, which is the length of a sample.
+    /// The number of metrics, which is also the number of values of a sample.
     pub fn len(&self) -> usize {
         self.items.len()
     }
 
-    /// Never: there is always the node's health.
+    /// Always `false`: the health of the gateway is always there.
     pub fn is_empty(&self) -> bool {
         self.items.is_empty()
     }
@@ -318,7 +319,7 @@ impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
         self.items.push(MetricItem { item, rule }).map_err(|_| NoRoom)
     }
 
-    /// Adds what the present owner does not have yet.
+    /// Adds an item unless the current owner has it already.
     fn add_once(&mut self, item: MetricSource) -> Result<(), NoRoom> {
         let start = self.starts.last().copied().unwrap_or(0);
         match self.items.iter().skip(start).any(|known| known.item == item) {
@@ -431,10 +432,10 @@ impl<const METRICS: usize> Catalog for GatewayCatalog<'_, METRICS> {
     }
 }
 
-/// The unit of a variable. A row of two units has three quantities of each, such as a pose.
+/// The unit of a variable. A row with two units has three quantities of each, such as a pose.
 fn unit_of(var: SysVar) -> &'static str {
     let unit = var.unit();
-    // The search of `core` for a text has panics that the optimiser keeps.
+    // The text search of `core` has panics that the optimiser does not remove.
     let comma = unit.bytes().position(|byte| byte == b',');
     match comma.and_then(|at| Some((unit.get(..at)?, unit.get(at.saturating_add(2)..)?))) {
         None => unit,
@@ -443,7 +444,7 @@ fn unit_of(var: SysVar) -> &'static str {
     }
 }
 
-/// The type of a variable's values.
+/// The metric type of the values of a variable.
 const fn data_type_of(ty: ScalarType) -> DataType {
     match ty {
         ScalarType::Byte => DataType::UInt8,
@@ -455,7 +456,7 @@ const fn data_type_of(ty: ScalarType) -> DataType {
     }
 }
 
-/// A value of a variable, of the type above.
+/// Converts a value of a variable to the type of [`data_type_of`].
 fn value_of(scalar: Scalar) -> Value {
     match scalar {
         Scalar::Byte(value) => Value::UInt8(value),
@@ -480,7 +481,7 @@ fn state_of(status: Status<'_>, item: MetricSource) -> Option<Value> {
     }))
 }
 
-/// A name with `_` for what topics give a meaning.
+/// Replaces characters that have a meaning in topics by `_`.
 fn part_of_topic(name: &str) -> DeviceName {
     let mut part = DeviceName::new();
     for character in name.chars() {

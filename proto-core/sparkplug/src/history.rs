@@ -1,14 +1,15 @@
-//! Values that could not be told when they were new: a bounded ring. When it is full the oldest goes, and is counted.
+//! A bounded ring of values that could not be published when they were new. When it is full, each new value removes the
+//! oldest one, which is counted.
 
 use crate::value::{Stamp, StoredValue};
 use heapless::Deque;
 
-/// A value of the past.
+/// A stored value.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Past {
     /// The place of its metric.
     pub place: u16,
-    /// It may have become unknown.
+    /// The value; it may be unknown.
     pub value: StoredValue,
     pub at: Stamp,
 }
@@ -24,7 +25,7 @@ impl<const ROOM: usize> History<ROOM> {
         Self { kept: Deque::new(), lost: 0 }
     }
 
-    /// Number of values that went for want of room.
+    /// Number of values that were removed because the ring was full.
     pub(crate) const fn lost(&self) -> u64 {
         self.lost
     }
@@ -40,7 +41,7 @@ impl<const ROOM: usize> History<ROOM> {
         let _ = self.kept.push_back(past);
     }
 
-    /// Brings one that is wanted to the front, in the order of the ring; false if there is none.
+    /// Rotates the ring until a value that `is_wanted` is in front. Returns `false` if there is none.
     pub(crate) fn find(&mut self, is_wanted: impl Fn(&Past) -> bool) -> bool {
         for _ in 0..self.kept.len() {
             match self.kept.front() {
@@ -54,12 +55,12 @@ impl<const ROOM: usize> History<ROOM> {
         false
     }
 
-    /// From the front on.
+    /// The values from the front on.
     pub(crate) fn iter(&self) -> impl Iterator<Item = &Past> {
         self.kept.iter()
     }
 
-    /// Takes so many from the front.
+    /// Removes this many values from the front.
     pub(crate) fn drop_front(&mut self, count: usize) {
         for _ in 0..count {
             let _ = self.kept.pop_front();

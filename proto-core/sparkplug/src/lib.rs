@@ -1,12 +1,12 @@
-//! An edge node of Sparkplug B 3.0 over MQTT 3.1.1, for a host and a board alike: docs/fleet.md says what is told.
+//! An edge node of Sparkplug B 3.0 over MQTT 3.1.1, for a host and a board alike: docs/fleet.md says what it publishes.
 //!
-//! In: samples of values, the bytes of an MQTT server, the present. Out: the bytes for the server. Knows no sockets,
-//! no TLS and no clock, and nothing here allocates. It only tells: the one command that it obeys is the request for
-//! new births.
+//! In: samples of values, the bytes of an MQTT server, the current time. Out: the bytes for the server. Does not know
+//! sockets, TLS or clocks, and allocates nothing. It only publishes: the one command that it obeys is the request for a
+//! rebirth.
 //!
-//! Beside the node are what a board needs of its own: its settings as bytes ([`document`]), and UTC ([`sntp`]).
+//! Beside the node is what a board needs in addition: its settings as bytes ([`document`]), and UTC ([`sntp`]).
 //!
-//! A driver has a connection and follows the contract of all state machines of this repository: change once, then
+//! A driver has a connection and follows the contract of all state machines of this repository: report one change, then
 //! drain the outputs.
 //!
 //! ```
@@ -45,12 +45,12 @@
 //! node.handle(now, Input::Time { utc_ms: 1_700_000_000_000 }, &Thermometer);
 //! node.handle(now, Input::Sample { values: &[Some(Value::Float(21.5))], alive: 0 }, &Thermometer);
 //! let mut buf = [0; MIN_BUFFER];
-//! // The driver opens a connection, and reports it.
+//! The driver opens a connection and reports it.
 //! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Open);
 //! node.handle(now, Input::Opened, &Thermometer);
-//! // It keeps this number over restarts, where it can.
+//! The driver stores this number, where it can, so that it survives restarts.
 //! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Keep { bd_seq: 0 });
-//! // From here on it sends what it is given, and reports what it receives.
+//! From here on, the driver sends the bytes that it gets, and reports those that it receives.
 //! let NodeOutput::Send(connect) = node.poll_output(now, &Thermometer, &mut buf) else { unreachable!() };
 //! assert_eq!(&connect[4..8], b"MQTT");
 //! assert!(matches!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Sleep { .. }));

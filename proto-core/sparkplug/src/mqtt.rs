@@ -1,31 +1,32 @@
-//! MQTT 3.1.1, as far as an edge node needs it: what it sends, and what it may receive.
+//! MQTT 3.1.1, as far as an edge node needs it: the packets that it sends, and those that it may receive.
 //!
-//! In: what a packet is to hold, and bytes of the peer in any pieces. Out: packets. Subscriptions are at QoS 1 and
-//! publications at QoS 0, so nothing waits for an acknowledgement and QoS 2 is a mistake of the peer.
+//! In: the contents of packets, and bytes of the server in pieces of any size. Out: packets. Subscriptions use QoS 1
+//! and
+//! publications QoS 0, so nothing waits for an acknowledgement, and QoS 2 is an error of the server.
 
 use crate::bytes::ByteWriter;
 
-/// Writes a packet: `body` is called twice.
+/// Writes a packet. Calls `body` twice: to measure and to write.
 pub(crate) fn packet(out: &mut ByteWriter<'_>, kind: u8, body: impl Fn(&mut ByteWriter<'_>)) {
     header(out, kind, ByteWriter::count(&body));
     body(out);
 }
 
-/// The beginning of a packet with so many bytes behind it.
+/// Writes the fixed header of a packet with `len` more bytes.
 pub(crate) fn header(out: &mut ByteWriter<'_>, kind: u8, len: usize) {
     out.byte(kind);
     crate::protobuf::varint(out, len as u64);
 }
 
-/// Text or bytes with their length before them.
+/// Writes text or bytes after their length.
 pub(crate) fn text(out: &mut ByteWriter<'_>, bytes: &[u8]) {
-    // What is longer is refused where it comes from; here it would only be cut.
+    // Longer texts are refused at their source; this only keeps the length in range.
     let len = u16::try_from(bytes.len()).unwrap_or(u16::MAX);
     out.put(&len.to_be_bytes());
     out.put(bytes.get(..usize::from(len)).unwrap_or_default());
 }
 
-/// Same, of a text that `write` writes; it is called twice.
+/// As [`text`], for a text that `write` writes. Calls `write` twice.
 pub(crate) fn text_of(out: &mut ByteWriter<'_>, write: impl Fn(&mut ByteWriter<'_>)) {
     let len = u16::try_from(ByteWriter::count(&write)).unwrap_or(u16::MAX);
     out.put(&len.to_be_bytes());
@@ -34,7 +35,7 @@ pub(crate) fn text_of(out: &mut ByteWriter<'_>, write: impl Fn(&mut ByteWriter<'
 
 pub(crate) const MAX_BODY: usize = 268_435_455;
 
-/// Kinds of packets, with their flags.
+/// Types of packets, with their flags.
 pub(crate) const CONNECT: u8 = 0x10;
 pub(crate) const PUBLISH: u8 = 0x30;
 pub(crate) const PUBACK: u8 = 0x40;
@@ -42,29 +43,29 @@ pub(crate) const SUBSCRIBE: u8 = 0x82;
 pub(crate) const PINGREQ: u8 = 0xC0;
 pub(crate) const DISCONNECT: u8 = 0xE0;
 
-/// A packet from the peer.
+/// A packet from the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Packet<'a> {
-    /// The answer to CONNECT; 0: accepted.
+    /// The reply to CONNECT.
     ConnAck {
-        /// The code.
+        /// The return code; 0: accepted.
         code: u8,
     },
     /// A message.
     Publish {
         /// Its topic.
         topic: &'a str,
-        /// What is in it.
+        /// Its payload.
         payload: &'a [u8],
-        /// The number to acknowledge; `None` at QoS 0.
+        /// The packet identifier to acknowledge; `None` at QoS 0.
         id: Option<u16>,
     },
-    /// The answer to SUBSCRIBE.
+    /// The reply to SUBSCRIBE.
     SubAck {
         /// Whether all subscriptions were accepted.
         is_accepted: bool,
     },
-    /// The answer to PINGREQ.
+    /// The reply to PINGREQ.
     PingResp,
 }
 
@@ -72,50 +73,51 @@ pub enum Packet<'a> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ProtocolError {
-    /// A packet with this first byte.
+    /// A packet that a server does not send.
     Unexpected {
-        /// The byte.
+        /// The first byte of the packet.
         first: u8,
     },
-    /// The length of a packet is not well-formed.
+    /// The length of a packet is malformed.
     Length,
-    /// A packet whose content is too short, too long or no text where text must be.
+    /// The content of a packet is too short, too long, or not text where text is required.
     Malformed {
-        /// Its first byte.
+        /// The first byte of the packet.
         first: u8,
     },
 }
 
-/// Received bytes. A publication that is longer than the room is skipped and counted.
+/// A buffer of received bytes. Publications longer than the buffer are skipped and counted.
 #[derive(Debug, Clone)]
 pub struct Inbox<const ROOM: usize> {
     buf: [u8; ROOM],
     len: usize,
-    /// Bytes of the packet that was returned last.
+    /// Length of the packet that was returned last, in bytes.
     used: usize,
-    /// Bytes that are still to be skipped.
+    /// Number of bytes that are still to be skipped.
     skip: usize,
     skipped: u32,
 }
 
 impl<const ROOM: usize> Inbox<ROOM> {
-    /// Empty. `ROOM` is to be at least 16.
+    /// An empty buffer. `ROOM` must be at least 16.
     pub const fn new() -> Self {
         Self { buf: [0; ROOM], len: 0, used: 0, skip: 0, skipped: 0 }
     }
 
-    /// Forgets everything but the count of what was skipped.
+    /// Clears everything but the count of skipped publications.
     pub fn clear(&mut self) {
         (self.len, self.used, self.skip) = (0, 0, 0);
     }
 
-    /// Number of publications that were too long.
+    /// Number of publications that were skipped because they were too long.
     pub const fn skipped(&self) -> u32 {
         self.skipped
     }
 
-    /// Takes as many of the bytes as there is room for, and returns how many. While [`Inbox::next_packet`] is called
-    /// until there is no packet left, there is always room.
+    /// Takes as many bytes as fit, and returns how many. If [`Inbox::next_packet`] is called until it returns no
+    /// packet,
+    /// there is always room.
     pub fn push(&mut self, bytes: &[u8]) -> usize {
         self.drop_used();
         let skipped = self.skip.min(bytes.len());
@@ -130,10 +132,10 @@ impl<const ROOM: usize> Inbox<ROOM> {
         skipped.saturating_add(count)
     }
 
-    /// The next whole packet.
+    /// The next complete packet.
     ///
     /// # Errors
-    /// If the peer does not speak MQTT 3.1.1 as a server. The connection is of no use then.
+    /// If the peer does not behave as an MQTT 3.1.1 server. The connection cannot be used after that.
     pub fn next_packet(&mut self) -> Result<Option<Packet<'_>>, ProtocolError> {
         self.drop_used();
         let bytes = self.buf.get(..self.len).unwrap_or_default();
@@ -183,13 +185,13 @@ impl<const ROOM: usize> Default for Inbox<ROOM> {
 fn check_first(first: u8) -> Result<(), ProtocolError> {
     match first {
         0x20 | 0x90 | 0xD0 => Ok(()),
-        // Any of retain and duplicate, at QoS 0 or 1.
+        // RETAIN and DUP in any combination, at QoS 0 or 1; no DUP at QoS 0.
         0x30..=0x3F if first & 0b100 == 0 && first & 0b1010 != 0b1000 => Ok(()),
         _ => Err(ProtocolError::Unexpected { first }),
     }
 }
 
-/// The length, and the number of bytes that it takes; `None` if they are not all there.
+/// The remaining length, and the number of bytes of its encoding; `None` if these have not all arrived.
 fn remaining_length(bytes: &[u8]) -> Result<Option<(usize, usize)>, ProtocolError> {
     let mut len = 0_usize;
     for (nth, shift) in [0_u32, 7, 14, 21].into_iter().enumerate() {

@@ -39,22 +39,22 @@ fn packets_come_whole_from_any_pieces() {
 #[test]
 fn what_no_server_sends_is_refused() {
     for wrong in [
-        // Packets of a client.
+        // Packets that only a client sends.
         &[0x10, 0][..],
         &[0x82, 0],
         &[0xC0, 0],
-        // Nothing was published at QoS 1 or 2.
+        // Acknowledgements, though nothing was published at QoS 1 or 2.
         &[0x40, 2, 0, 1],
         &[0x00, 0],
         &[0xF0, 0],
-        // Flags.
+        // Wrong flags.
         &[0x21, 2, 0, 0],
         &[0xD1, 0],
-        // QoS 2 and 3, and a repetition at QoS 0.
+        // QoS 2 and 3, and DUP at QoS 0.
         &[0x34, 5, 0, 1, b'a', 0, 1],
         &[0x36, 5, 0, 1, b'a', 0, 1],
         &[0x38, 3, 0, 1, b'a'],
-        // Lengths.
+        // Wrong lengths.
         &[0x30, 0x80, 0x80, 0x80, 0x80],
         &[0x20, 1, 0],
         &[0x20, 3, 0, 0, 0],
@@ -63,12 +63,12 @@ fn what_no_server_sends_is_refused() {
         &[0x90, 3, 0, 1, 3],
         &[0xD0, 1, 0],
         &[0x20, 0x80, 1],
-        // Topics.
+        // Wrong topics.
         &[0x30, 2, 0, 0],
         &[0x30, 3, 0, 2, b'a'],
         &[0x30, 3, 0, 1, b'+'],
         &[0x30, 3, 0, 1, 0xFF],
-        // Numbers of packets.
+        // Wrong packet identifiers.
         &[0x32, 4, 0, 1, b'a', 0],
         &[0x32, 5, 0, 1, b'a', 0, 0],
     ] {

@@ -1,8 +1,8 @@
 //! The edge node: sessions, births, data, deaths.
 //!
-//! In: [`Input`]s with the present. Out: [`NodeOutput`]s. A session is one connection: CONNECT with the death as its will,
-//! the subscription to commands, births of the node and of each device that is alive, then data by exception. What
-//! changes while there is no session is kept and told later, marked as historical.
+//! In: [`Input`]s with the current time. Out: [`NodeOutput`]s. A session is one connection: CONNECT with the death as
+//! will, the subscription to commands, births of the node and of each device that is alive, then data by exception.
+//! Changes without a session are stored and published later, marked as historical.
 
 mod io;
 mod messages;
@@ -23,26 +23,26 @@ pub use io::{Input, NodeCounters, NodeError, NodeOutput, SessionFailure};
 pub use messages::MAX_METRIC;
 pub use settings::{Credential, MAX_TEXT, Settings};
 
-/// The least length of the buffer for [`EdgeNode::poll_output`]. A longer one gives fewer and longer pieces.
+/// The shortest buffer for [`EdgeNode::poll_output`]. A longer buffer gives fewer and longer packets.
 pub const MIN_BUFFER: usize = 768;
 
-/// The longest packet that is received; longer publications are skipped.
+/// The longest packet that is received. Longer publications are skipped.
 const MAX_PACKET: usize = 512;
 
-/// An edge node with room for so many metrics, and for so many values while nobody listens.
+/// An edge node with room for `METRICS` metrics, and for `HISTORY` values while it has no session.
 #[derive(Debug, Clone)]
 pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     settings: Settings,
     slots: Vec<NodeMetric, METRICS>,
-    /// Where the metrics of the node and of each device begin, and where the last ones end.
+    /// Where the metrics of the node and of each device begin; the last entry is the end.
     starts: Vec<u16, { MAX_DEVICES + 2 }>,
     history: History<HISTORY>,
     clock: UtcClock,
     /// When the values were sampled.
     sampled_at: Instant,
-    /// The date of the birth that is on its way, and of the values that it tells.
+    /// The time stamps of the birth that is being sent.
     dates: Dates,
-    /// Devices that work, and those that were born in this session.
+    /// Devices that work. `born` has those that were born in this session.
     alive: u32,
     born: u32,
     device_births: [Option<Instant>; MAX_DEVICES],
@@ -56,7 +56,7 @@ pub struct EdgeNode<const METRICS: usize, const HISTORY: usize> {
     birth_at: Option<Instant>,
     is_rebirth_wanted: bool,
     host: Maybe<HostState>,
-    /// The connection is of no use.
+    /// The connection has failed and must be closed.
     must_close: bool,
     is_ending: bool,
     online_since: Option<Instant>,
@@ -71,7 +71,7 @@ struct NodeMetric {
     data_type: DataType,
     is_pending: bool,
     current: StoredValue,
-    /// The last one told, and when it was sampled; never if none was.
+    /// The last published value, and when it was sampled: `Stamp::NEVER` if no value was published.
     published: StoredValue,
     published_at: Stamp,
 }
@@ -79,14 +79,14 @@ struct NodeMetric {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 enum NodePhase {
-    /// No connection until then. It is the first, so that a node that is not made yet is all zeros.
+    /// No connection before `until`. The first variant, so that an idle node is all zeros.
     Idle {
         until: Instant,
     },
     Opening {
         until: Instant,
     },
-    /// The number of the session is to be kept, then CONNECT is to be sent.
+    /// The driver has to store the session number; then CONNECT is sent.
     Keep,
     Connect,
     Connecting {
@@ -96,21 +96,21 @@ enum NodePhase {
     Subscribing {
         until: Instant,
     },
-    /// The primary host is not there.
+    /// Waits for the primary host.
     Waiting,
     Birth(Birth),
     Online,
-    /// The death of the node is to be sent, then DISCONNECT.
+    /// The death of the node is sent next, then DISCONNECT.
     Death,
     Disconnect,
     Ended,
 }
 
-/// What a birth says of the time. It is fixed when the birth begins, as its length is.
+/// The time stamps of a birth. They are fixed when the birth begins, because its length is fixed too.
 #[derive(Debug, Clone, Copy)]
 struct Dates {
     now_ms: u64,
-    /// Of the values that it tells.
+    /// When the published values were sampled.
     sampled_ms: u64,
     is_utc: bool,
 }
@@ -123,16 +123,16 @@ struct Birth {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
-    /// Nothing is written yet, and the values that it tells are not chosen.
+    /// Nothing is written yet, and the values to publish are not chosen.
     Begin,
-    /// The metrics before this place have so many bytes.
+    /// The metrics before place `next` take `len` bytes.
     Measure { next: usize, len: usize },
-    /// The metric at this place is next, and so many bytes are left.
+    /// The metric at place `next` is written next; `left` bytes remain.
     Metrics { next: usize, left: usize },
 }
 
 impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
-    /// A node that is not made yet: all its bytes are zero. It waits until it is made by [`Self::configure`].
+    /// A node with all bytes zero, which does nothing until [`Self::configure`] is called.
     pub const fn idle() -> Self {
         Self {
             settings: Settings::empty(),
@@ -165,11 +165,11 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
     }
 
-    /// A node without a session. `bd_seq` is what [`NodeOutput::Keep`] gave before a restart; `seed` is another one
-    /// for each node, so that they do not all come back at the same time.
+    /// A node without a session. `bd_seq` is the number that [`NodeOutput::Keep`] gave before a restart. `seed` differs
+    /// from node to node, so they do not all reconnect at the same time.
     ///
     /// # Errors
-    /// If the catalog has too much, or names that cannot be part of a topic.
+    /// If the catalog is too large, or has names that cannot be part of a topic.
     pub fn new(
         settings: Settings,
         catalog: &impl Catalog,
@@ -181,10 +181,10 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         Ok(node)
     }
 
-    /// Makes an [idle](Self::idle) node, in its place; [`Self::new`] says of what.
+    /// Configures an [idle](Self::idle) node in place, with the arguments of [`Self::new`].
     ///
     /// # Errors
-    /// Those of [`Self::new`]. It is of no use then.
+    /// Those of [`Self::new`]. The node cannot be used then.
     pub fn configure(
         &mut self,
         settings: &Settings,
@@ -226,7 +226,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         Ok(())
     }
 
-    /// Takes one input. `now` never goes back; the catalog is always the same.
+    /// Handles one input. `now` must never go back; the catalog must always be the same.
     pub fn handle(&mut self, now: Instant, input: Input<'_>, catalog: &impl Catalog) {
         match input {
             Input::Opened => {
@@ -254,44 +254,44 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             Input::Sampled { alive } => self.sampled(now, alive, catalog),
             Input::Time { utc_ms } => {
                 let is_new = self.clock.set(now, utc_ms);
-                // What was told before has no date.
+                // Values that were published without UTC have no valid time stamp.
                 self.is_rebirth_wanted |= is_new && self.publishes();
             }
             Input::End => self.is_ending = true,
         }
     }
 
-    /// Counts since the node was made.
+    /// Counters since the node was made.
     pub fn counters(&self) -> NodeCounters {
         NodeCounters { lost: self.history.lost(), kept: self.history.len(), ..self.counters }
     }
 
-    /// Why the last session or attempt failed; `None` while there is a session.
+    /// Why the last session or attempt failed; `None` while a session is established.
     pub const fn failure(&self) -> Option<SessionFailure> {
         self.failure.get()
     }
 
-    /// Whether the node and its devices were born and data is told.
+    /// Whether the births were sent and data is published.
     pub const fn is_online(&self) -> bool {
         matches!(self.phase, NodePhase::Online)
     }
 
-    /// Whether there is a connection, as far as the driver has said.
+    /// Whether there is a connection, according to the driver.
     pub const fn is_connected(&self) -> bool {
         !matches!(self.phase, NodePhase::Idle { .. } | NodePhase::Opening { .. } | NodePhase::Ended)
     }
 
-    /// Whether it has died as [`Input::End`] asked.
+    /// Whether the node has ended, as [`Input::End`] requested.
     pub const fn has_ended(&self) -> bool {
         matches!(self.phase, NodePhase::Ended)
     }
 
-    /// The number of the newest session; `None` before the first.
+    /// The `bdSeq` number of the newest session; `None` before the first.
     pub const fn bd_seq(&self) -> Option<u8> {
         self.bd_seq
     }
 
-    /// Whether changes are published and not stored.
+    /// Whether changes are published; otherwise they are stored.
     const fn publishes(&self) -> bool {
         matches!(self.phase, NodePhase::Birth(_) | NodePhase::Online)
     }
@@ -323,7 +323,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                 let is_due = at.is_none_or(|at| now.saturating_since(at) >= report.min_interval);
                 slot.is_pending = is_alive && is_due && slot.is_changed(report.dead_band);
                 if slot.is_pending && !publishes {
-                    // The first value is no change.
+                    // The first value is not a change.
                     let is_change = at.is_some();
                     slot.tell(now);
                     if is_change {
@@ -356,7 +356,8 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                     Packet::PingResp => PacketContent::Pong,
                     Packet::Publish { topic, payload, id } => {
                         if let Some(id) = id {
-                            // The session ends before the server would send it again.
+                            // If it does not fit, the server could only repeat the message after this session has
+                            // ended.
                             let _ = self.acks.push_back(id);
                         }
                         let Settings { group, node, primary_host, .. } = &self.settings;
@@ -374,7 +375,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                 self.take(now, event);
             }
             if taken == 0 {
-                // There is always room for a whole packet.
+                // Cannot happen: the buffer always has room for a complete packet.
                 return self.fail(SessionFailure::Broken);
             }
         }
@@ -404,14 +405,14 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
                 self.is_rebirth_wanted |= asked.is_rebirth && self.publishes();
             }
             (PacketContent::Host(state), _) => {
-                // An older statement may come late.
+                // An older state may arrive late.
                 if self.host.get().is_none_or(|known| state.timestamp >= known.timestamp) {
                     self.host = Maybe::Just(state);
                     self.look_for_host();
                 }
             }
             (PacketContent::Unreadable, _) => counters.unreadable = counters.unreadable.saturating_add(1),
-            // An answer to something that was not asked.
+            // A reply without a request.
             (PacketContent::Accepted(_), _) => {
                 self.fail(SessionFailure::Protocol(ProtocolError::Unexpected { first: 0x20 }))
             }
@@ -421,7 +422,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
     }
 
-    /// Begins to tell when the primary host is there, if one is waited for.
+    /// Begins the births when the primary host is online, or if there is none.
     fn look_for_host(&mut self) {
         let is_there = match (&self.settings.primary_host, self.host.get()) {
             (None, _) => true,
@@ -431,12 +432,12 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
             NodePhase::Waiting if is_there => {
                 self.phase = NodePhase::Birth(Birth { owner: Owner::Node, stage: Stage::Begin });
             }
-            // A packet that was begun is finished first.
+            // A packet that was begun is completed first.
             _ => {}
         }
     }
 
-    /// Whether the primary host says that it is not there.
+    /// Whether the primary host reports that it is offline.
     fn is_host_gone(&self) -> bool {
         self.host.get().is_some_and(|host| !host.is_online)
     }
@@ -451,7 +452,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         self.must_close = true;
     }
 
-    /// The session is over.
+    /// Leaves the session and starts the pause before the next attempt.
     fn leave_session(&mut self, now: Instant) {
         let was_steady = self.online_since.take().is_some_and(|since| now.saturating_since(since) >= STEADY);
         self.attempts = if was_steady { 1 } else { self.attempts.saturating_add(1) };
@@ -465,7 +466,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
     }
 
-    /// The pause before the next attempt: longer each time, and random, so that many nodes do not come together.
+    /// The pause before the next attempt: longer each time, and random, so that not all nodes reconnect at once.
     fn pause(&mut self) -> Duration {
         self.random ^= self.random << 13;
         self.random ^= self.random >> 7;
@@ -497,14 +498,13 @@ impl NodeMetric {
         }
     }
 
-    /// Its value was told, of this instant.
+    /// The current value was published; it was sampled at `at`.
     fn tell(&mut self, at: Instant) {
         (self.published, self.published_at, self.is_pending) = (self.current, Stamp::of(at), false);
     }
 }
 
-/// An option that is all zeros when there is nothing, whatever could be in it: so a node that is not made yet takes no
-/// flash.
+/// An option whose empty state is all zeros for any `T`, so an idle node takes no flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 enum Maybe<T> {
@@ -530,18 +530,18 @@ enum PacketContent {
     Unreadable,
 }
 
-/// The node, then so many devices.
+/// The node, then its devices.
 fn owners(devices: usize) -> impl Iterator<Item = Owner> {
     let devices = u8::try_from(devices).unwrap_or(u8::MAX);
     core::iter::once(Owner::Node).chain((0..devices).map(Owner::Device))
 }
 
-/// Whether a device is in the set.
+/// Whether a device is in the bit set.
 fn has(set: u32, nth: u8) -> bool {
     set.checked_shr(nth.into()).unwrap_or(0) & 1 != 0
 }
 
-/// How long a session must have lasted for the next attempt to come soon.
+/// After a session of at least this length, the pause is short again.
 const STEADY: Duration = Duration::from_secs(60);
 /// The longest pause before the first attempt.
 const FIRST_PAUSE: Duration = Duration::from_secs(2);

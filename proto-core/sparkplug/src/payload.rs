@@ -1,12 +1,12 @@
-//! Payloads of Sparkplug B: metrics with their descriptions, and what a command or a host's state says.
+//! Payloads of Sparkplug B: writes metrics with their properties, and reads commands and the state of a host.
 //!
-//! Written is message `Payload` of `sparkplug_b.proto`; the numbers of fields are from there.
+//! The format is message `Payload` of `sparkplug_b.proto`, with its field numbers.
 
 use crate::bytes::ByteWriter;
 use crate::protobuf::{self, Malformed, ProtobufField, ProtobufFields};
 use crate::value::{DataType, Value};
 
-/// What a birth says about a metric beside its name and type.
+/// What a birth says about a metric in addition to its name and type.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Details<'a> {
     /// Property `engUnit`, unless it is empty.
@@ -19,18 +19,18 @@ pub(crate) struct Details<'a> {
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PayloadMetric<'a> {
-    /// Its name, in births.
+    /// The name, in births only.
     pub name: Option<&'a str>,
     pub alias: Option<u64>,
-    /// When the value was taken: milliseconds.
+    /// When the value was sampled, in milliseconds.
     pub timestamp: u64,
-    /// Its type, in births.
+    /// The type, in births only.
     pub data_type: Option<DataType>,
-    /// Whether it is no present value.
+    /// Whether the value is historical.
     pub is_historical: bool,
-    /// Its value; `None` if it is unknown.
+    /// The value; `None` if it is unknown.
     pub value: Option<Value>,
-    /// What a birth says.
+    /// The properties, in births only.
     pub details: Details<'a>,
 }
 
@@ -42,7 +42,7 @@ pub(crate) fn metric(out: &mut ByteWriter<'_>, shown: &PayloadMetric<'_>) {
     protobuf::message(out, 2, |out| body(out, shown));
 }
 
-/// The end of a payload with a sequence number.
+/// Writes the end of a payload: its sequence number.
 pub(crate) fn end(out: &mut ByteWriter<'_>, seq: u8) {
     protobuf::number(out, 3, seq.into());
 }
@@ -52,13 +52,13 @@ pub(crate) fn death(out: &mut ByteWriter<'_>, timestamp: u64, bd_seq: u8) {
     metric(out, &bd_seq_metric(timestamp, bd_seq));
 }
 
-/// The metric that ties births and deaths.
+/// The metric `bdSeq`, which links a birth to its death.
 pub(crate) fn bd_seq_metric(timestamp: u64, bd_seq: u8) -> PayloadMetric<'static> {
     let value = Value::Int64(bd_seq.into());
     plain("bdSeq", timestamp, value)
 }
 
-/// A metric of a birth that has no alias.
+/// A metric of a birth without an alias.
 pub(crate) fn plain(name: &'static str, timestamp: u64, value: Value) -> PayloadMetric<'static> {
     PayloadMetric {
         name: Some(name),
@@ -99,7 +99,7 @@ fn body(out: &mut ByteWriter<'_>, shown: &PayloadMetric<'_>) {
 
 fn write_value(out: &mut ByteWriter<'_>, value: Value) {
     match value {
-        // As two's complement.
+        // In two's complement.
         Value::Int64(value) => protobuf::number(out, 11, value as u64),
         Value::UInt8(value) => protobuf::number(out, 10, value.into()),
         Value::UInt16(value) => protobuf::number(out, 10, value.into()),
@@ -112,7 +112,7 @@ fn write_value(out: &mut ByteWriter<'_>, value: Value) {
     }
 }
 
-/// Message `PropertySet`: first all keys, then all values.
+/// Writes message `PropertySet`: first all keys, then all values.
 fn properties(out: &mut ByteWriter<'_>, details: &Details<'_>) {
     let Details { unit, range, description } = *details;
     let texts = [("engUnit", unit), ("documentation", description)];
@@ -139,15 +139,15 @@ fn properties(out: &mut ByteWriter<'_>, details: &Details<'_>) {
     }
 }
 
-/// What a command asks for.
+/// What a command requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct Asked {
     pub is_rebirth: bool,
-    /// Number of other metrics, which nobody may write.
+    /// Number of other metrics in the command; none of them is writable.
     pub others: u32,
 }
 
-/// Reads the payload of NCMD.
+/// Parses the payload of NCMD.
 pub(crate) fn command(payload: &[u8]) -> Result<Asked, Malformed> {
     let mut asked = Asked::default();
     for field in ProtobufFields::of(payload) {
@@ -169,17 +169,17 @@ pub(crate) fn command(payload: &[u8]) -> Result<Asked, Malformed> {
     Ok(asked)
 }
 
-/// What a primary host says of itself.
+/// The state of a primary host, as it publishes it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct HostState {
-    /// Whether it is there.
+    /// Whether the host is online.
     pub is_online: bool,
-    /// Of that statement: milliseconds.
+    /// Time stamp of the state in milliseconds.
     pub timestamp: u64,
 }
 
-/// Reads the payload of STATE: an object of JSON with `online` and `timestamp`. Objects and lists in it, and
-/// escapes in its keys, are refused.
+/// Parses the payload of STATE: a JSON object with `online` and `timestamp`. Nested objects and arrays, and escapes in
+/// keys, are refused.
 pub(crate) fn host_state(payload: &[u8]) -> Option<HostState> {
     let text = core::str::from_utf8(payload).ok()?.trim_ascii();
     let mut rest = text.strip_prefix('{')?.strip_suffix('}')?;

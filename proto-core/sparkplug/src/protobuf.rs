@@ -1,14 +1,14 @@
 //! The encoding of Protocol Buffers, as far as payloads of Sparkplug B need it.
 //!
-//! In: fields. Out: bytes; and the fields of received bytes, one after the other. The reader is strict: a field
-//! that is cut off or has an unknown form ends it.
+//! In: fields, or received bytes. Out: bytes, or their fields, one after the other. The reader is strict: it stops at a
+//! field that is cut off or has an unknown wire type.
 
 use crate::bytes::ByteWriter;
 
-/// Writes a number in groups of seven bits.
+/// Writes a number in groups of seven bits, the lowest first.
 pub(crate) fn varint(out: &mut ByteWriter<'_>, mut value: u64) {
     while value > 0x7F {
-        // Only the lowest seven bits count.
+        // The cast keeps the low byte, and the mask its lowest seven bits.
         out.byte((value & 0x7F) as u8 | 0x80);
         value >>= 7;
     }
@@ -19,7 +19,7 @@ fn key(out: &mut ByteWriter<'_>, field: u8, form: u8) {
     varint(out, u64::from(field) << 3 | u64::from(form));
 }
 
-/// A field with a whole number.
+/// Writes a field with an integer.
 pub(crate) fn number(out: &mut ByteWriter<'_>, field: u8, value: u64) {
     key(out, field, VARINT);
     varint(out, value);
@@ -35,14 +35,14 @@ pub(crate) fn double(out: &mut ByteWriter<'_>, field: u8, value: f64) {
     out.put(&value.to_le_bytes());
 }
 
-/// A field with text or bytes.
+/// Writes a field with text or bytes.
 pub(crate) fn bytes(out: &mut ByteWriter<'_>, field: u8, value: &[u8]) {
     key(out, field, LENGTH);
     varint(out, value.len() as u64);
     out.put(value);
 }
 
-/// A field with a message of its own, which `write` writes; it is called twice.
+/// Writes a field with an embedded message. Calls `write` twice: to measure and to write.
 pub(crate) fn message(out: &mut ByteWriter<'_>, field: u8, write: impl Fn(&mut ByteWriter<'_>)) {
     key(out, field, LENGTH);
     varint(out, ByteWriter::count(&write) as u64);
@@ -58,11 +58,11 @@ pub(crate) enum ProtobufField<'a> {
     Bytes(&'a [u8]),
 }
 
-/// Bytes that are no message.
+/// The bytes are no valid message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Malformed;
 
-/// The fields of a message, with their numbers. Ends after the first mistake.
+/// The fields of a message with their numbers. Ends after the first error.
 #[derive(Debug, Clone)]
 pub(crate) struct ProtobufFields<'a> {
     rest: &'a [u8],
@@ -131,7 +131,7 @@ impl<'a> Iterator for ProtobufFields<'a> {
     }
 }
 
-/// The forms of a value.
+/// Wire types.
 const VARINT: u8 = 0;
 const FIXED64: u8 = 1;
 const LENGTH: u8 = 2;

@@ -1,65 +1,65 @@
-//! UTC from a server of SNTP (RFC 4330), for a board without a clock of its own.
+//! UTC from an SNTP server (RFC 4330), for a board without a clock of its own.
 //!
-//! In: datagrams of the server, the present. Out: requests, and UTC once a reply can be trusted to be the answer to
-//! the newest request. Knows no sockets. A server is only believed: nothing here is authenticated (docs/threats.md).
+//! In: datagrams of the server, the current time. Out: requests, and UTC once a reply is known to answer the newest
+//! request. Does not know sockets. The server is trusted, as nothing here is authenticated (docs/threats.md).
 //!
-//! A driver calls [`Sntp::poll`], sends the request that it returns, gives each datagram of the server to
+//! A driver calls [`Sntp::poll`], sends the request that it returns, passes each datagram of the server to
 //! [`Sntp::receive`], and waits until [`Sntp::deadline`].
 
 use proto_core::time::{Duration, Instant};
 
-/// Length of a request, and of a reply without keys.
+/// Length of a request, and of a reply without an authenticator, in bytes.
 pub const PACKET: usize = 48;
 
 /// A client of one server.
 #[derive(Debug, Clone, Copy)]
 pub struct Sntp {
     next: Instant,
-    /// The request that was not answered: its time stamp, and when it left.
+    /// The unanswered request: its time stamp, and when it was sent.
     asked: Option<([u8; 8], Instant)>,
-    /// Requests without a reply that was of use, one after the other.
+    /// Number of requests in a row without a usable reply.
     failures: u8,
     random: u64,
     counters: SntpCounters,
 }
 
-/// Counts since the start.
+/// Counters since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SntpCounters {
-    /// Requests.
+    /// Requests that were sent.
     pub requests: u32,
-    /// Replies that told the time.
+    /// Replies that gave the time.
     pub replies: u32,
-    /// Datagrams that were no such reply.
+    /// Datagrams that were refused.
     pub refused: u32,
 }
 
-/// Why a datagram does not tell the time.
+/// Why a datagram does not give the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ReplyError {
-    /// Fewer bytes than a reply has.
+    /// The datagram is shorter than a reply.
     Short {
-        /// Its bytes.
+        /// Its length in bytes.
         len: usize,
     },
-    /// Nothing was asked, or it answers another request.
+    /// There was no request, or the datagram answers another one.
     Originate,
-    /// It is no server's reply, or of an unknown version.
+    /// It is not the reply of a server, or its version is unknown.
     Mode {
-        /// Leap indicator, version and mode.
+        /// The byte with leap indicator, version and mode.
         first: u8,
     },
-    /// The server wants no more requests, or fewer (kiss-o'-death).
+    /// The server wants fewer or no requests (kiss-o'-death).
     Kiss {
         /// Its code, such as `RATE`.
         code: [u8; 4],
     },
-    /// The server does not know the time itself.
+    /// The server is not synchronised itself.
     Unsynchronised,
-    /// It says 0, or a year that a reply of today cannot have.
+    /// The time is 0, or in a year that is not plausible.
     Time,
-    /// It came so late that it says little.
+    /// The reply came so late that it is too inaccurate.
     Late,
 }
 
@@ -80,18 +80,18 @@ impl core::fmt::Display for ReplyError {
 impl core::error::Error for ReplyError {}
 
 impl Sntp {
-    /// A client that asks at once. `seed` is another one at each start.
+    /// A client that sends its first request at once. `seed` must differ at each start.
     pub const fn new(seed: u64) -> Self {
         let counters = SntpCounters { requests: 0, replies: 0, refused: 0 };
         Self { next: Instant::ZERO, asked: None, failures: 0, random: seed | 1, counters }
     }
 
-    /// Counts since the start.
+    /// Counters since the start.
     pub const fn counters(&self) -> SntpCounters {
         self.counters
     }
 
-    /// When it is to be polled again.
+    /// When to call [`Sntp::poll`] next.
     pub const fn deadline(&self) -> Instant {
         self.next
     }
@@ -101,12 +101,12 @@ impl Sntp {
         if now < self.next {
             return None;
         }
-        // It counts as failed until its reply is there.
+        // A request counts as failed until its reply arrives.
         self.failures = self.failures.saturating_add(1);
         self.next = now + self.pause();
         self.counters.requests = self.counters.requests.saturating_add(1);
-        // The server returns this stamp as it is. A random one can be guessed by nobody who does not see the request,
-        // and does not tell when the board was started.
+        // The server returns this stamp unchanged. A random one cannot be guessed without seeing the request, and does
+        // not reveal when the board was started.
         let stamp = self.next_random().to_be_bytes();
         self.asked = Some((stamp, now));
         let mut request = [0; PACKET];
@@ -119,10 +119,10 @@ impl Sntp {
         Some(request)
     }
 
-    /// Milliseconds since 1970, at `now`, of a datagram of the server.
+    /// UTC at `now` from a datagram of the server, in milliseconds since 1970.
     ///
     /// # Errors
-    /// Why it does not tell the time. It is counted.
+    /// Why the datagram does not give the time. It is counted as refused.
     pub fn receive(&mut self, now: Instant, datagram: &[u8]) -> Result<u64, ReplyError> {
         let told = self.told(now, datagram);
         match told {
@@ -133,7 +133,7 @@ impl Sntp {
             }
             Err(error) => {
                 self.counters.refused = self.counters.refused.saturating_add(1);
-                // One who says so is not asked again soon. Only the server knows the stamp.
+                // This server is not asked again soon. The reply is genuine: only the server knows the stamp.
                 if matches!(error, ReplyError::Kiss { .. }) {
                     (self.asked, self.failures) = (None, DOUBLINGS);
                     self.next = now + LONGEST;
@@ -172,7 +172,7 @@ impl Sntp {
         if seconds == 0 && fraction == 0 {
             return Err(ReplyError::Time);
         }
-        // Seconds wrap in 2036: what is before 1968 as seconds since 1900 is of the next era (RFC 4330 section 3).
+        // Seconds wrap in 2036: a value that would be before 1968 belongs to the next era (RFC 4330 section 3).
         let era = if seconds & 0x8000_0000 == 0 { 1_u64 << 32 } else { 0 };
         let since_1900 = u64::from(seconds).saturating_add(era);
         let seconds = since_1900.checked_sub(FROM_1900_TO_1970).ok_or(ReplyError::Time)?;
@@ -181,12 +181,11 @@ impl Sntp {
         if !PLAUSIBLE.contains(&utc_ms) {
             return Err(ReplyError::Time);
         }
-        // It left half a round trip ago.
+        // The reply was sent half a round trip ago.
         Ok(utc_ms.saturating_add(round_trip.as_millis() >> 1))
     }
 
-    /// The pause until another request if this one is not answered: 4 s, and twice as long each time up to 17 min, less
-    /// a random quarter.
+    /// The pause after a request without a reply: 4 s, doubled each time up to 17 min, less a random quarter.
     fn pause(&mut self) -> Duration {
         let doublings = u32::from(self.failures.saturating_sub(1).min(DOUBLINGS));
         let most = FIRST.as_micros().checked_shl(doublings).unwrap_or(0);
@@ -203,19 +202,19 @@ impl Sntp {
     }
 }
 
-/// The first pause after a request without a reply.
+/// The first pause without a reply.
 const FIRST: Duration = Duration::from_secs(4);
-/// How often it is doubled: up to 1024 s.
+/// How often the pause is doubled: up to 1024 s.
 const DOUBLINGS: u8 = 8;
 /// The pause after a reply.
 const USUAL: Duration = Duration::from_secs(1_024);
 /// The pause after a kiss-o'-death.
 const LONGEST: Duration = Duration::from_secs(3_600);
-/// The longest round trip; half of it is how wrong the time can be.
+/// The longest accepted round trip; the error of the time is at most half of it.
 const LATEST: Duration = Duration::from_secs(2);
 /// Seconds from 1900 to 1970.
 const FROM_1900_TO_1970: u64 = 2_208_988_800;
-/// Milliseconds since 1970: from 2024, before which there was no such program, to 2100.
+/// Milliseconds since 1970: from 2024, before which this program did not exist, to 2100.
 const PLAUSIBLE: core::ops::Range<u64> = 1_704_067_200_000..4_102_444_800_000;
 
 #[cfg(test)]

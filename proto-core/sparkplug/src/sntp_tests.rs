@@ -2,7 +2,7 @@ use super::*;
 
 const UTC_MS: u64 = 1_750_000_000_250;
 
-/// The right reply to a request, which says this time.
+/// A valid reply to a request, with this time.
 fn reply(request: &[u8; PACKET], utc_ms: u64) -> [u8; PACKET] {
     let mut reply = [0; PACKET];
     (reply[0], reply[1]) = (0x24, 2);
@@ -26,7 +26,7 @@ fn a_reply_tells_the_time_with_half_of_its_way() {
     assert_eq!(sntp.poll(at(100)), None);
     assert_eq!(sntp.receive(at(140), &reply(&request, UTC_MS)), Ok(UTC_MS + 20));
     assert_eq!(sntp.deadline(), at(140) + USUAL);
-    // The same again answers nothing.
+    // A repeated reply answers no request.
     assert_eq!(sntp.receive(at(141), &reply(&request, UTC_MS)), Err(ReplyError::Originate));
     assert_eq!(sntp.counters(), SntpCounters { requests: 1, replies: 1, refused: 1 });
 }
@@ -63,7 +63,7 @@ fn what_is_wrong_tells_nothing_and_the_right_one_is_still_taken() {
     for len in 0..PACKET {
         assert_eq!(sntp.receive(at(110), &right[..len]), Err(ReplyError::Short { len }));
     }
-    // Keys of NTP may follow; version 3 is as good.
+    // An authenticator may follow, and version 3 is accepted too.
     let mut long = [0; 68];
     long[..PACKET].copy_from_slice(&with(0, 0x1C));
     assert_eq!(sntp.receive(at(110), &long), Ok(UTC_MS + 5));
@@ -73,7 +73,7 @@ fn what_is_wrong_tells_nothing_and_the_right_one_is_still_taken() {
 fn the_era_after_2036_is_known() {
     let mut sntp = Sntp::new(7);
     let request = sntp.poll(at(0)).unwrap();
-    // 2040: the seconds have wrapped.
+    // In 2040 the seconds have wrapped.
     let of_2040 = 2_208_988_800_000;
     assert_eq!(sntp.receive(at(0), &reply(&request, of_2040)), Ok(of_2040));
 }
@@ -100,7 +100,7 @@ fn one_who_sends_a_kiss_is_left_alone_for_an_hour() {
     let mut kiss = reply(&request, UTC_MS);
     kiss[1] = 0;
     kiss[12..16].copy_from_slice(b"RATE");
-    // Not one of somebody else's.
+    // A kiss-o'-death without our stamp is refused.
     let mut foreign = kiss;
     foreign[27] ^= 1;
     assert_eq!(sntp.receive(at(5), &foreign), Err(ReplyError::Originate));

@@ -1,28 +1,28 @@
-//! Names of groups, nodes, devices and hosts, and the topics that are made of them (Sparkplug 3.0, chapter 4).
+//! Names of groups, nodes, devices and hosts, and the topics that contain them (Sparkplug 3.0, chapter 4).
 
 use heapless::String;
 
 use crate::bytes::ByteWriter;
 
-/// The longest name, in bytes.
+/// The longest name in bytes.
 pub const MAX_ID: usize = 64;
 
 /// The name of a group, a node, a device or a host.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Id(String<MAX_ID>);
 
-/// Why something is no name.
+/// Why a text is not a valid name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum IdError {
-    /// It is empty.
+    /// The name is empty.
     Empty,
-    /// It has so many bytes; [`MAX_ID`] are allowed.
+    /// The name is longer than [`MAX_ID`].
     Long {
-        /// Its bytes.
+        /// Its length in bytes.
         len: usize,
     },
-    /// It has a character that topics give a meaning: `+`, `/`, `#`, or a control character.
+    /// The name has a control character, or one with a meaning in topics: `+`, `/` or `#`.
     Reserved {
         /// The character.
         character: char,
@@ -36,7 +36,7 @@ impl Id {
         String::try_from(name).map(Self).map_err(|_| IdError::Long { len: name.len() })
     }
 
-    /// Of what is not made yet.
+    /// The name of an idle node.
     pub(crate) const fn empty() -> Self {
         Self(String::new())
     }
@@ -47,7 +47,7 @@ impl Id {
     }
 }
 
-/// Whether a name can be part of a topic.
+/// Checks whether a name can be part of a topic.
 pub(crate) fn check(name: &str) -> Result<(), IdError> {
     let is_reserved = |c: &char| matches!(c, '+' | '/' | '#') || c.is_control();
     match name.chars().find(is_reserved) {
@@ -70,7 +70,7 @@ impl core::fmt::Display for IdError {
 
 impl core::error::Error for IdError {}
 
-/// Which message it is.
+/// The type of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Verb {
     Birth,
@@ -79,7 +79,7 @@ pub(crate) enum Verb {
     Command,
 }
 
-/// Writes the topic of a message of the node, or of its device.
+/// Writes the topic of a message of the node, or of one of its devices.
 pub(crate) fn write(out: &mut ByteWriter<'_>, group: &Id, verb: Verb, node: &Id, device: Option<&str>) {
     out.put(b"spBv1.0/");
     out.put(group.0.as_bytes());
@@ -97,7 +97,7 @@ pub(crate) fn write(out: &mut ByteWriter<'_>, group: &Id, verb: Verb, node: &Id,
     }
 }
 
-/// Whether a topic is that of the node's commands.
+/// Whether the node receives its commands on this topic.
 pub(crate) fn is_command(topic: &str, group: &Id, node: &Id) -> bool {
     let rest = topic.strip_prefix("spBv1.0/").and_then(|rest| rest.strip_prefix(group.as_str()));
     rest.and_then(|rest| rest.strip_prefix("/NCMD/")) == Some(node.as_str())
@@ -108,7 +108,7 @@ pub(crate) fn write_state(out: &mut ByteWriter<'_>, host: &Id) {
     out.put(host.0.as_bytes());
 }
 
-/// Whether a topic is that of the host's state.
+/// Whether the host publishes its state on this topic.
 pub(crate) fn is_state(topic: &str, host: &Id) -> bool {
     topic.strip_prefix(STATE) == Some(host.as_str())
 }

@@ -1,8 +1,8 @@
-//! Values of metrics and their types.
+//! Values of metrics, and their types.
 
 use proto_core::time::Instant;
 
-/// Type of a metric, with its code in Sparkplug B.
+/// The type of a metric, with its code in Sparkplug B.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum DataType {
@@ -26,7 +26,7 @@ pub enum DataType {
     String = 12,
 }
 
-/// Value of a metric.
+/// The value of a metric.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Value {
     /// Signed, 64 bits.
@@ -39,13 +39,13 @@ pub enum Value {
     UInt32(u32),
     /// Unsigned, 64 bits.
     UInt64(u64),
-    /// IEEE 754, 32 bits; if it is no finite number it is sent as unknown.
+    /// IEEE 754, 32 bits; sent as unknown unless it is finite.
     Float(f32),
-    /// IEEE 754, 64 bits; if it is no finite number it is sent as unknown.
+    /// IEEE 754, 64 bits; sent as unknown unless it is finite.
     Double(f64),
     /// True or false.
     Boolean(bool),
-    /// One of several words.
+    /// One of several fixed words, of type [`DataType::String`].
     Word(&'static str),
 }
 
@@ -65,7 +65,7 @@ impl Value {
         }
     }
 
-    /// The value, unless it is a float that is no finite number.
+    /// The value, unless it is a float that is not finite.
     pub(crate) fn known(self) -> Option<Self> {
         match self {
             Self::Float(value) if !value.is_finite() => None,
@@ -74,7 +74,7 @@ impl Value {
         }
     }
 
-    /// Whether it is far enough from another one to be told: more than `dead_band` for numbers.
+    /// Whether the difference to `other` is large enough to publish: more than `dead_band` for numbers.
     pub(crate) fn differs(self, other: Self, dead_band: f64) -> bool {
         match (self.number(), other.number()) {
             (Some(one), Some(two)) if dead_band > 0.0 => (one - two).abs() > dead_band,
@@ -96,11 +96,11 @@ impl Value {
     }
 }
 
-/// A value that may be unknown, next to its type. Takes less memory than an `Option<Value>`, of which a node has many.
+/// A value that may be unknown; its type is stored elsewhere. Takes less memory than `Option<Value>`: a node has many.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum StoredValue {
     Unknown,
-    /// Of a number: the low half first.
+    /// The bits of a number, the low half first.
     Bits([u32; 2]),
     Word(&'static str),
 }
@@ -143,12 +143,12 @@ impl StoredValue {
     }
 }
 
-/// An instant that needs no alignment of 8 bytes.
+/// An instant with an alignment of only 4 bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Stamp([u32; 2]);
 
 impl Stamp {
-    /// [`Instant::NEVER`].
+    /// Stands for [`Instant::NEVER`].
     pub(crate) const NEVER: Self = Self(halves(Instant::NEVER.as_micros()));
 
     pub(crate) const fn of(at: Instant) -> Self {
@@ -160,7 +160,7 @@ impl Stamp {
     }
 }
 
-/// The low half first.
+/// Splits 64 bits into halves, the low one first.
 const fn halves(bits: u64) -> [u32; 2] {
     [bits as u32, (bits >> 32) as u32]
 }
@@ -206,7 +206,7 @@ mod tests {
         assert!(!float(1.0).differs(float(1.0), 0.0));
         assert!(Value::Boolean(true).differs(Value::Boolean(false), 9.0));
         assert!(Value::Word("a").differs(Value::Word("b"), 9.0));
-        // Above 2^53, where doubles have gaps.
+        // Above 2^53, `f64` cannot represent every integer.
         assert!(Value::UInt64(u64::MAX).differs(Value::UInt64(u64::MAX - 1), 0.0));
     }
 
