@@ -1,4 +1,4 @@
-//! Converts a Sparkplug file for a board: settings in the form of `recipe_sparkplug::document`.
+//! Converts a Sparkplug file to settings for a board, in the format of `recipe_sparkplug::document`.
 
 use std::path::Path;
 
@@ -9,10 +9,10 @@ use recipe_sparkplug::topic::Id;
 
 use crate::file::settings_of;
 
-/// Reads a Sparkplug file and its file with user and password, and returns the bytes for a board.
+/// Reads a Sparkplug file and its login file with user and password, and writes them as bytes for a board.
 ///
 /// # Errors
-/// The first mistake, or something that boards do not support, as one message with its place.
+/// The first mistake, or a setting that a board does not support, as one message with its place.
 pub fn settings(path: &Path) -> Result<Vec<u8>, String> {
     let file = load_sparkplug(path, |name| Id::new(name).map(|_| ()).map_err(|error| error.to_string()));
     let file = file.map_err(|error| error.to_string())?;
@@ -41,7 +41,7 @@ fn of(file: &SparkplugFile) -> Result<Vec<u8>, String> {
         Some((server, port)) => Some((host("time.server", server)?, *port)),
         None => None,
     };
-    // The capacities are the limits of the file.
+    // The file allows no more than these.
     document.values = file.values.iter().copied().collect();
     document.rules = file
         .rules

@@ -1,4 +1,4 @@
-//! Connections to a broker.
+//! Connections to an MQTT broker.
 
 use std::io;
 use std::net::ToSocketAddrs;
@@ -13,7 +13,7 @@ use rustls::{ClientConfig, RootCertStore};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio_rustls::TlsConnector;
 
-/// A broker, with or without TLS.
+/// A broker, and how to connect to it.
 #[derive(Debug, Clone)]
 pub struct Broker {
     host: String,
@@ -32,10 +32,10 @@ impl Broker {
         Self { host: host.into(), port, tls: None }
     }
 
-    /// A broker with TLS 1.2 or 1.3, which must have a certificate for `host` from one of these authorities.
+    /// A broker with TLS 1.2 or 1.3. It must present a certificate for `host` from one of these authorities.
     ///
     /// # Errors
-    /// If the file cannot be read or has no certificates, as one message.
+    /// One message, if the file cannot be read or contains no certificates.
     pub fn with_tls(host: impl Into<String>, port: u16, authorities: &Path) -> Result<Self, String> {
         let refused = |why: &dyn std::fmt::Display| format!("{}: {why}", authorities.display());
         let mut roots = RootCertStore::empty();
@@ -57,7 +57,7 @@ impl Broker {
         Ok(Self { host, port, tls: Some(Arc::new(config)) })
     }
 
-    /// The address, for people.
+    /// Host and port, for people.
     pub fn address(&self) -> String {
         format!("{}:{}", self.host, self.port)
     }
@@ -76,7 +76,7 @@ impl Broker {
     }
 }
 
-/// Ends a connection after sent data has arrived: closing a socket with unread data would reset it.
+/// Closes a connection so that all sent data arrives: closing a socket that has unread data would reset it.
 pub(crate) async fn close(mut stream: Box<dyn BrokerConnection>) {
     let _ = tokio::time::timeout(CLOSE_TIME, async {
         stream.shutdown().await?;
@@ -87,5 +87,5 @@ pub(crate) async fn close(mut stream: Box<dyn BrokerConnection>) {
     .await;
 }
 
-/// How long the end of a connection may take.
+/// The longest time that closing a connection may take.
 const CLOSE_TIME: Duration = Duration::from_millis(500);

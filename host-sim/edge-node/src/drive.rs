@@ -1,4 +1,4 @@
-//! Connects an edge node to its broker and executes its outputs.
+//! Connects an edge node to its broker, and executes everything that the node requests.
 
 use std::io;
 use std::time::{Duration, SystemTime};
@@ -14,34 +14,34 @@ use tokio::time::{Instant as TokioInstant, MissedTickBehavior, interval, sleep_u
 
 use crate::broker::{Broker, BrokerConnection, close};
 
-/// The source of values.
+/// A source of values.
 pub trait Sampler {
-    /// Writes the present values to their places.
+    /// Writes the current values into their places.
     fn sample(&mut self, node: &NodeCounters, values: &mut [Option<Value>]) -> impl Future<Output = Sampled>;
 }
 
-/// The result of a sample.
+/// The result of taking a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sampled {
-    /// The values were written, and these devices work.
+    /// The values were written, and the devices in this bit set work.
     Alive(u32),
-    /// There are no values at the moment.
+    /// No values are available at the moment.
     Nothing,
-    /// The metrics will change: the node is to die.
+    /// The catalog is about to change, so the node has to end.
     Changed,
 }
 
-/// Stores and reports what a node requests.
+/// Receives what a node wants stored, and what happens to it.
 pub trait Listener {
-    /// Stores the session number, which must survive restarts.
+    /// Stores the number of the session so that it survives restarts.
     fn keep(&mut self, bd_seq: u8);
     /// The births were sent.
     fn online(&mut self);
-    /// There is no session, for this reason; an error of the connection has details.
+    /// There is no session, for this reason. `error` tells more if the connection failed.
     fn failed(&mut self, failure: SessionFailure, error: Option<&io::Error>);
 }
 
-/// Drives a node until it has died, because `end` became true or the sampler returned [`Sampled::Changed`].
+/// Drives a node until it has ended, because `end` became `true` or the sampler returned [`Sampled::Changed`].
 pub async fn drive<const METRICS: usize, const HISTORY: usize>(
     node: &mut EdgeNode<METRICS, HISTORY>,
     catalog: &impl Catalog,
@@ -52,14 +52,14 @@ pub async fn drive<const METRICS: usize, const HISTORY: usize>(
     mut end: watch::Receiver<bool>,
 ) {
     let mut ticks = interval(period);
-    // After a pause, the next tick is a period later: values are sampled now, not for missed ticks.
+    // After a pause, the next tick comes one period later: missed samples cannot be taken afterwards.
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let places = (0..=catalog.devices()).map(|nth| match nth.checked_sub(1) {
         None => catalog.metrics(recipe_sparkplug::catalog::Owner::Node),
         Some(device) => catalog.metrics(recipe_sparkplug::catalog::Owner::Device(device as u8)),
     });
     let mut samples = Samples { values: vec![None; places.sum()], misses: 0 };
-    // The first births already have values and timestamps.
+    // So that the first births already have values and time stamps.
     samples.take(node, catalog, sampler).await;
     ticks.tick().await;
     let mut driver = SessionDriver { stream: None, error: None, was_online: false, logged: None };
@@ -77,7 +77,7 @@ pub async fn drive<const METRICS: usize, const HISTORY: usize>(
             }
         };
         tokio::pin!(open);
-        // Sampling continues while a connection is being made.
+        // Samples continue while a connection is being established.
         loop {
             let stream = async {
                 match &mut driver.stream {
@@ -125,12 +125,12 @@ pub async fn drive<const METRICS: usize, const HISTORY: usize>(
 
 struct Samples {
     values: Vec<Option<Value>>,
-    /// Number of consecutive samples without values.
+    /// Number of samples in a row without values.
     misses: u32,
 }
 
 impl Samples {
-    /// Gives the node one sample and the time. Returns true if the node is to die.
+    /// Gives the node one sample and the time. Returns `true` if the node has to end.
     async fn take<const METRICS: usize, const HISTORY: usize>(
         &mut self,
         node: &mut EdgeNode<METRICS, HISTORY>,
@@ -161,14 +161,15 @@ impl Samples {
 
 struct SessionDriver {
     stream: Option<Box<dyn BrokerConnection>>,
-    /// Why there is no connection.
+    /// Why the last connection failed.
     error: Option<io::Error>,
     was_online: bool,
     logged: Option<SessionFailure>,
 }
 
 impl SessionDriver {
-    /// Executes the node's outputs until it waits. Returns whether to connect, and the end of the wait.
+    /// Executes the outputs of the node until it waits. Returns whether to open a connection, and until when the node
+    /// waits.
     async fn drain<const METRICS: usize, const HISTORY: usize>(
         &mut self,
         node: &mut EdgeNode<METRICS, HISTORY>,
@@ -180,7 +181,7 @@ impl SessionDriver {
         let until = loop {
             match node.poll_output(now(), catalog, buf) {
                 NodeOutput::Open => is_opening = true,
-                // Continue without yielding: a host measures a birth in one go.
+                // On a host there are no other tasks to let run: continue at once.
                 NodeOutput::Busy => {}
                 NodeOutput::Keep { bd_seq } => listener.keep(bd_seq),
                 NodeOutput::Send(bytes) => {
@@ -206,7 +207,7 @@ impl SessionDriver {
                 .unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
         {
             self.lost(node, catalog, Some(error));
-            // The node decides what follows.
+            // The node decides what comes next.
             return Box::pin(self.drain(node, catalog, buf, listener)).await;
         }
         match (node.is_online(), node.failure()) {
@@ -241,17 +242,17 @@ fn utc_ms() -> Option<u64> {
 
 fn deadline(until: Instant) -> TokioInstant {
     let left = Duration::from_micros(until.saturating_since(now()).as_micros());
-    // A node without a deadline is polled after this time all the same.
+    // A node that waits for nothing is polled occasionally anyway.
     TokioInstant::now() + left.min(LONGEST)
 }
 
-/// Length of the node's chunks, and of a read.
+/// Size of the buffers for sending and receiving in bytes.
 const BUFFER: usize = 8_192;
-/// How long the broker may read nothing.
+/// How long the broker may accept no data.
 const WRITE_TIME: Duration = Duration::from_secs(10);
-/// Maximum time between two polls of a node.
+/// The longest time between two polls of a node.
 const LONGEST: Duration = Duration::from_secs(3_600);
-/// Number of samples without values after which the values are unknown.
+/// After this many samples in a row without values, all values are unknown.
 const MAX_MISSES: u32 = 5;
-/// Milliseconds from 1970 to 2024.
+/// 2024-01-01 in milliseconds since 1970. An earlier system time is not valid.
 const OF_2024: u64 = 1_704_067_200_000;

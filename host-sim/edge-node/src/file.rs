@@ -1,4 +1,4 @@
-//! A Sparkplug file, the files that it names, and the settings of a node and its driver.
+//! A Sparkplug file, the files that it names, and what a node and its driver need of them.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -16,11 +16,11 @@ use crate::broker::Broker;
 pub struct PublisherConfig {
     /// The broker.
     pub broker: Broker,
-    /// The node's names.
+    /// The names of the node, and its MQTT settings.
     pub settings: Settings,
-    /// Sampling interval of the gateway.
+    /// The time between two samples of the gateway.
     pub sample: Duration,
-    /// The file of the session number.
+    /// The file that stores the number of the session.
     pub bd_seq: Option<PathBuf>,
     rules: Vec<PublishRule>,
     file: SparkplugFile,
@@ -45,7 +45,7 @@ impl PublisherConfig {
         }
         let settings = settings_of(&file).map_err(of_file)?;
         if let Some(kept) = &file.bd_seq {
-            // Mistakes show before anything runs.
+            // So that a mistake in the file is reported before anything runs.
             read_bd_seq(kept).map_err(|why| of_file(format!("node.bd_seq: {why}")))?;
         }
         let rules = file.rules.iter().map(|rule| PublishRule {
@@ -57,7 +57,7 @@ impl PublisherConfig {
         Ok(Self { broker, settings, sample, bd_seq: file.bd_seq.clone(), rules: rules.collect(), file })
     }
 
-    /// Publishing rates.
+    /// When changes are published.
     pub fn rates(&self) -> Rates<'_> {
         Rates {
             min_interval: self.file.interval,
@@ -68,7 +68,7 @@ impl PublisherConfig {
     }
 }
 
-/// The names of a file's node, and its login.
+/// The settings of a file's node, with the login if there is one.
 pub(crate) fn settings_of(file: &SparkplugFile) -> Result<Settings, String> {
     let id = |name: &str| Id::new(name).map_err(|error| error.to_string());
     let mut settings = Settings::new(id(&file.group)?, id(&file.node)?);
@@ -83,10 +83,10 @@ pub(crate) fn settings_of(file: &SparkplugFile) -> Result<Settings, String> {
     Ok(settings)
 }
 
-/// Reads a file with two lines, user and password, that nobody else can read.
+/// Reads a file with two lines, user and password, which only its owner may be able to read.
 ///
 /// # Errors
-/// What is wrong with the file, without its contents.
+/// What is wrong with the file, without repeating its contents.
 pub fn read_login(path: &Path) -> Result<(Credential, Credential), String> {
     let refused = |why: &str| format!("{}: {why}", path.display());
     let text = read_private(path, 1_000).map_err(|error| refused(&error.to_string()))?;
@@ -100,7 +100,7 @@ pub fn read_login(path: &Path) -> Result<(Credential, Credential), String> {
     user.zip(Credential::new(password)).ok_or_else(|| refused("a line is longer than 129 bytes"))
 }
 
-/// The number of the last session; `None` if there was none.
+/// Reads the number of the last session; `None` if there was none.
 ///
 /// # Errors
 /// What is wrong with the file.
@@ -115,7 +115,7 @@ pub fn read_bd_seq(path: &Path) -> Result<Option<u8>, String> {
     }
 }
 
-/// Stores the number of a session atomically.
+/// Stores the number of a session atomically: the file has either the old or the new number.
 pub fn write_bd_seq(path: &Path, number: u8) -> std::io::Result<()> {
     Beside::file(path, format!("{number}\n").as_bytes())?.0.replace(path)
 }

@@ -1,6 +1,6 @@
-//! Many simulated nodes in one process, to test brokers and subscribers.
+//! Many simulated nodes in one process, to test brokers and the clients that read from them.
 //!
-//! Each has the metrics of a gateway with two field ports. Some values change with each sample, as in a real cell.
+//! Each node has the metrics of a gateway with two field ports. Some values change with each sample, as in a real cell.
 
 use std::cell::RefCell;
 use std::io;
@@ -18,7 +18,7 @@ use tokio::task::LocalSet;
 use crate::broker::Broker;
 use crate::drive::{Listener, Sampled, Sampler, drive};
 
-/// What to simulate.
+/// The nodes to simulate.
 #[derive(Debug, Clone)]
 pub struct Fleet {
     /// The broker of all nodes.
@@ -29,13 +29,13 @@ pub struct Fleet {
     pub group: Id,
     /// User and password of all nodes.
     pub login: Option<(Credential, Credential)>,
-    /// Sampling period of each node.
+    /// The time between two samples of a node.
     pub period: Duration,
-    /// Duration of the simulation.
+    /// How long to simulate.
     pub length: Duration,
 }
 
-/// The sums over all nodes.
+/// Counters of all nodes together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Totals {
     /// Nodes that are online.
@@ -44,9 +44,9 @@ pub struct Totals {
     pub sessions: u64,
     /// Births of nodes.
     pub births: u64,
-    /// Births that were requested.
+    /// Births of nodes that were requested by a command.
     pub rebirths: u64,
-    /// Messages of data.
+    /// Data messages.
     pub data: u64,
     /// Values that were published late.
     pub historical: u64,
@@ -56,13 +56,13 @@ pub struct Totals {
     pub failures: u64,
 }
 
-/// Memory of a node without its connection, in bytes.
+/// Memory of a node in bytes, without its connection.
 pub const NODE_BYTES: usize = size_of::<SimulatedNode>();
 
 type SimulatedNode = EdgeNode<METRICS, 64>;
 
 impl Fleet {
-    /// Runs the nodes, and calls `each_second` with the totals so far.
+    /// Runs the nodes, and calls `each_second` with the counters so far.
     ///
     /// # Errors
     /// If the runtime cannot be started, or there are too many nodes for their names.
@@ -85,7 +85,7 @@ impl Fleet {
                 let mut sampler = SimulatedSampler { random: seed, step: 0, nth, all: Rc::clone(&all) };
                 let mut listener = Watched { nth, all: Rc::clone(&all) };
                 tasks.spawn_local(async move {
-                    // Start the nodes at different instants.
+                    // Spreads the samples of the nodes over the period.
                     let offset = period.mul_f64((seed % 1_000) as f64 / 1_000.0);
                     tokio::time::sleep(offset).await;
                     drive(&mut node, &SimulatedCatalog, &broker, period, &mut sampler, &mut listener, ended)
@@ -189,7 +189,7 @@ impl Listener for Watched {
     }
 }
 
-/// The metrics of a cell's gateway.
+/// The metrics of a gateway.
 struct SimulatedCatalog;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -201,12 +201,12 @@ enum MetricKind {
     Float,
 }
 
-/// Metrics of the node, and of each of two devices.
+/// Number of metrics of the node, and of each of its two devices.
 const OF_NODE: usize = 12;
 const OF_DEVICE: usize = 10;
 const METRICS: usize = OF_NODE + 2 * OF_DEVICE;
 
-/// The kind of a metric, and its number among those of its owner.
+/// The owner of a metric, and its number among the metrics of this owner.
 fn place_in(place: usize) -> (Owner, usize) {
     match place.checked_sub(OF_NODE) {
         None => (Owner::Node, place),

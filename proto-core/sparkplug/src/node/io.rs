@@ -1,4 +1,4 @@
-//! What a node takes, asks for and counts, and why it cannot be made or has no session.
+//! The inputs, outputs and counters of a node, and why it cannot be configured or has no session.
 
 use proto_core::time::Instant;
 
@@ -6,93 +6,95 @@ use crate::mqtt::ProtocolError;
 use crate::topic::IdError;
 use crate::value::Value;
 
-/// What happened.
+/// An input of the node.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Input<'a> {
-    /// The connection that was asked for is there.
+    /// The requested connection is established.
     Opened,
-    /// It could not be made, or is gone.
+    /// The connection could not be established, or is lost.
     Closed,
-    /// Bytes of the server.
+    /// Bytes from the server.
     Bytes(&'a [u8]),
-    /// All values at this instant, by the places of the catalog; `None`: unknown. What is missing at the end is
-    /// unknown too.
+    /// All values at this instant, by their places in the catalog; `None`: unknown. Values missing at the end are
+    /// unknown
+    /// too.
     Sample {
         /// The values.
         values: &'a [Option<Value>],
         /// The devices that work: bit n is device n.
         alive: u32,
     },
-    /// Values of the next sample, by the places from this one on; `None`: unknown.
+    /// Values of the next sample, from a place on; `None`: unknown.
     Values {
-        /// The place of the first one.
+        /// The place of the first value.
         first: usize,
         /// The values.
         values: &'a [Option<Value>],
     },
-    /// All values were given by [`Input::Values`]: they are those of this instant.
+    /// The sample is complete: the values given by [`Input::Values`] are those of this instant.
     Sampled {
         /// The devices that work, as in [`Input::Sample`].
         alive: u32,
     },
-    /// UTC at this instant.
+    /// The UTC of this instant.
     Time {
         /// Milliseconds since 1970.
         utc_ms: u64,
     },
-    /// Die, close the connection and open none any more.
+    /// Send the death, close the connection, and open none again.
     End,
 }
 
-/// What is to be done.
+/// What the driver has to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NodeOutput<'b> {
-    /// Open a connection to the server, and report [`Input::Opened`] or [`Input::Closed`].
+    /// Open a connection to the server, then report [`Input::Opened`] or [`Input::Closed`].
     Open,
-    /// Keep this number where it survives a restart, before the next output is asked for.
+    /// Store this number so that it survives a restart, before the next call of
+    /// [`EdgeNode::poll_output`](super::EdgeNode::poll_output).
     Keep {
         /// The number, to be given to [`EdgeNode::new`](super::EdgeNode::new) after a restart.
         bd_seq: u8,
     },
-    /// Send all these bytes before the next output is asked for.
+    /// Send all these bytes before the next call of [`EdgeNode::poll_output`](super::EdgeNode::poll_output).
     Send(&'b [u8]),
-    /// Close the connection; it is not to be reported.
+    /// Close the connection, without reporting it.
     Close,
-    /// There is more to do: ask again. Others may run before, and inputs may be given.
+    /// There is more to do: call again. Other tasks may run first, and inputs may be given.
     Busy,
-    /// Nothing until then, or until the next input.
+    /// Nothing to do until then, or until the next input.
     Sleep {
         /// [`Instant::NEVER`] if there is nothing to wait for.
         until: Instant,
     },
 }
 
-/// Why a node cannot be made.
+/// Why a node cannot be configured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum NodeError {
-    /// More metrics than there is room for.
+    /// The catalog has more metrics than there is room for.
     Metrics {
         /// Their number.
         count: usize,
-        /// The room.
+        /// The maximum number.
         room: usize,
     },
-    /// More devices than [`MAX_DEVICES`](crate::catalog::MAX_DEVICES).
+    /// The catalog has more devices than [`MAX_DEVICES`](crate::catalog::MAX_DEVICES).
     Devices {
         /// Their number.
         count: usize,
     },
     /// The name of a device cannot be part of a topic.
     Device {
-        /// The device.
+        /// The number of the device.
         nth: usize,
         /// What is wrong with its name.
         error: IdError,
     },
     /// Two devices have the same name.
     SameDevice {
-        /// The second one.
+        /// The number of the second one.
         nth: usize,
     },
     /// The catalog has no metric at a place.
@@ -102,17 +104,17 @@ pub enum NodeError {
     },
 }
 
-/// Why a session ended or did not begin.
+/// Why a session ended or could not begin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SessionFailure {
-    /// There was no connection, or it broke.
+    /// The connection could not be established, or was lost.
     Closed,
     /// The server did not answer in time.
     Silent,
-    /// The server refused CONNECT, with this code of MQTT 3.1.1.
+    /// The server refused CONNECT with this MQTT 3.1.1 return code.
     Refused {
-        /// 4: wrong user or password, 5: not authorised.
+        /// The return code; 4: wrong user or password, 5: not authorised.
         code: u8,
     },
     /// The server refused the subscription.
@@ -121,7 +123,8 @@ pub enum SessionFailure {
     Protocol(ProtocolError),
     /// The primary host is offline.
     HostOffline,
-    /// The catalog, or the driver's buffer, does not keep what is written of it.
+    /// What was written does not match its computed length, because the catalog changed or the driver's buffer is too
+    /// short.
     Broken,
 }
 
@@ -143,7 +146,7 @@ impl core::fmt::Display for SessionFailure {
 
 impl core::error::Error for SessionFailure {}
 
-/// Counts since the node was made.
+/// Counters since the node was made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]
 pub struct NodeCounters {
@@ -151,19 +154,19 @@ pub struct NodeCounters {
     pub sessions: u32,
     /// Births of the node.
     pub births: u32,
-    /// Those of them that were asked for.
+    /// Births of the node that were requested by a command.
     pub rebirths: u32,
-    /// Messages of data.
+    /// Data messages.
     pub data: u64,
-    /// Values that were told late, marked as historical.
+    /// Values that were published late, marked as historical.
     pub historical: u64,
-    /// Values that were never told, because there was no room to keep them.
+    /// Values that were never published, because there was no room to store them.
     pub lost: u64,
-    /// Values that wait to be told.
+    /// Values that wait to be published.
     pub kept: usize,
-    /// Commands that were not obeyed: metrics that nobody may write.
+    /// Metrics in commands that were refused, as they are not writable.
     pub refused: u32,
-    /// Messages that nobody could read, or that were too long.
+    /// Messages that were malformed or too long.
     pub unreadable: u32,
     /// Sessions and attempts that failed.
     pub failures: u32,
@@ -172,7 +175,7 @@ pub struct NodeCounters {
 }
 
 impl NodeCounters {
-    /// Before anything has happened.
+    /// All counters at zero.
     pub const NONE: Self = Self {
         sessions: 0,
         births: 0,

@@ -1,4 +1,4 @@
-//! The messages of a node, as packets of MQTT.
+//! The messages of a node, as MQTT packets.
 
 use super::{Birth, Dates, EdgeNode, Owner, Stage, has};
 use crate::bytes::ByteWriter;
@@ -9,18 +9,18 @@ use crate::topic::{self, Verb};
 use crate::value::Value;
 use proto_core::time::Instant;
 
-/// The most bytes of a metric in a birth; a longer one is left out.
+/// The longest metric in a birth, in bytes. Longer metrics are left out.
 pub const MAX_METRIC: usize = 512;
 
-/// What became of a piece of a birth.
+/// The result of writing a piece of a birth.
 pub(super) enum BirthPiece<'b> {
-    /// There is none yet.
+    /// Nothing to send yet.
     Later,
-    /// These bytes, and there is more.
+    /// These bytes, and more will follow.
     Part(&'b [u8]),
     /// The last bytes.
     Last(&'b [u8]),
-    /// The lengths do not agree: the catalog is not the same as before.
+    /// The lengths differ: the catalog has changed.
     Broken,
 }
 
@@ -30,7 +30,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         let mut out = ByteWriter::new(buf);
         mqtt::packet(&mut out, mqtt::CONNECT, |out| {
             mqtt::text(out, b"MQTT");
-            // Level 4; a clean session, and a will at QoS 1 that is not retained.
+            // Protocol level 4; clean session, and a will at QoS 1 that is not retained.
             let login = if settings.login.is_some() { 0xC0 } else { 0 };
             out.put(&[4, 0x02 | 0x04 | 0x08 | login]);
             out.put(&settings.keep_alive_s().to_be_bytes());
@@ -59,7 +59,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         out.finish()
     }
 
-    /// The death that the node publishes itself, before it disconnects.
+    /// The death that the node publishes itself before it disconnects.
     pub(super) fn write_death<'b>(&self, now: Instant, buf: &'b mut [u8]) -> Option<&'b [u8]> {
         let mut out = ByteWriter::new(buf);
         mqtt::packet(&mut out, mqtt::PUBLISH, |out| {
@@ -158,7 +158,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
     }
 
-    /// Data of one owner that is to be told; `None` if there is none.
+    /// Writes the pending values of one owner; `None` if there are none.
     pub(super) fn write_data<'b>(
         &mut self,
         now: Instant,
@@ -179,7 +179,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         let told = || places.clone().filter_map(shown).take(count);
         let written = self.write_metrics(now, catalog, owner, told, buf)?;
         let sampled_at = self.sampled_at;
-        // As many as were written, in the same order.
+        // The slots of the written metrics, in the same order.
         let slots = self.slots.iter_mut().take(places.end).skip(places.start);
         for slot in slots.filter(|slot| slot.is_pending).take(count) {
             slot.tell(sampled_at);
@@ -188,7 +188,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         Some(written)
     }
 
-    /// Values of the past of one owner; `None` if there are none that can be told.
+    /// Writes the stored values of one owner; `None` if none can be published.
     pub(super) fn write_history<'b>(
         &mut self,
         now: Instant,
@@ -223,7 +223,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         Some(written)
     }
 
-    /// How many of the metrics go into one packet of so many bytes.
+    /// How many of the metrics fit in a packet of `room` bytes.
     fn room_for<'m>(
         &self,
         now: Instant,
@@ -268,13 +268,13 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         out.finish()
     }
 
-    /// A message of data with the next number was written.
+    /// Counts a data message, and its sequence number.
     fn count_data(&mut self) {
         self.next_seq();
         self.counters.data = self.counters.data.saturating_add(1);
     }
 
-    /// The values that the birth tells, and its number.
+    /// Fixes the time stamps, the values and the sequence number of a birth.
     fn begin_birth(&mut self, now: Instant, owner: Owner) {
         let sampled_at = self.sampled_at;
         self.dates = Dates {
@@ -294,7 +294,8 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         }
     }
 
-    /// What a birth of the node has beside the catalog. Nobody may write by an alias, so there is none.
+    /// Writes the metrics that a birth of the node has in addition to the catalog. None has an alias, which a
+    /// command could use to write it.
     fn write_own_metrics(&self, out: &mut ByteWriter<'_>) {
         let at = self.dates.sampled_ms;
         payload::metric(out, &payload::bd_seq_metric(at, self.session()));
@@ -302,7 +303,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         payload::metric(out, &payload::plain(UTC, at, Value::Boolean(self.dates.is_utc)));
     }
 
-    /// 0 if the metric is left out.
+    /// The length of a metric in a birth; 0 if the metric is left out.
     fn birth_metric_len(&self, catalog: &impl Catalog, place: usize) -> usize {
         match ByteWriter::count(|out| self.write_birth_metric(out, catalog, place)) {
             len @ 0..=MAX_METRIC => len,
@@ -325,7 +326,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
         topic::write(out, &self.settings.group, verb, &self.settings.node, device);
     }
 
-    /// The places of an owner's metrics.
+    /// The range of places of an owner's metrics.
     pub(super) fn places(&self, owner: Owner) -> core::ops::Range<usize> {
         let index = match owner {
             Owner::Node => 0,
@@ -345,7 +346,7 @@ impl<const METRICS: usize, const HISTORY: usize> EdgeNode<METRICS, HISTORY> {
     }
 }
 
-/// A metric as data has it. Aliases begin at 1: for some readers 0 is none.
+/// A metric in a data message. Aliases begin at 1, because some readers take 0 for none.
 fn data_metric<'m>(
     place: usize,
     timestamp: u64,
