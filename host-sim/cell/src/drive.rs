@@ -55,7 +55,7 @@ impl Cell {
         self.queue.next().min(engine).min(self.controller_wake).min(self.devices_wake)
     }
 
-    /// Updates the deadline after something has happened to a device.
+    /// Something was done with a device, so its deadline may have changed.
     pub(super) fn note_deadlines(&mut self) {
         let lines = self.lines.iter().filter_map(|line| line.device.as_ref()).map(|device| device.deadline());
         let buses = self.buses.iter().filter_map(|bus| bus.device.as_ref()).map(|device| device.deadline());
@@ -144,7 +144,7 @@ impl Cell {
         if let Some(oracle) = &mut self.oracle {
             oracle.input(now, &input, &self.engine);
         }
-        // An output can cause an input, so each level has its own buffer.
+        // Executing an output can cause another input, so each of these nested calls takes a buffer of its own.
         let mut buf = self.buffer.take().unwrap_or_else(|| Box::new([0; OUTPUT_BUFFER]));
         loop {
             let output = self.engine.poll_output(now, &mut buf);
@@ -164,7 +164,7 @@ impl Cell {
         self.buffer = Some(buf);
     }
 
-    /// Executes the engine's output; false if it was `Sleep`.
+    /// Executes an output of the engine; returns false if it was `Sleep`.
     fn execute_output(&mut self, output: Output<'_>) -> bool {
         let now = self.now;
         if let Some(recorder) = &mut self.recorder {
@@ -230,7 +230,7 @@ impl Cell {
         self.controller_is_seen = false;
     }
 
-    /// The model sees the controller's registers, if it needs them.
+    /// Shows the controller's registers to the model, if it needs them.
     fn show_controller(&mut self) {
         if let Some(judge) = &mut self.judge {
             judge.sees_controller(self.controller.registers().image(), self.now);
@@ -375,8 +375,9 @@ impl Cell {
         }
     }
 
-    /// A datagram arrives at a port where the gateway listens: it answers the first sender, and after
-    /// that moves only to the sender of a frame.
+    /// A datagram arrives at a listening port of the gateway. The gateway answers the first sender; later it switches
+    /// only to
+    /// the sender of a valid frame.
     fn client_datagram(&mut self, link: LinkId, from: Sender, bytes: &[u8]) {
         let gate = self.gate(link);
         if gate.is_cut(Way::Down) && from != Sender::Stranger || !gate.is_open {
@@ -415,14 +416,14 @@ impl Cell {
     }
 }
 
-/// A frame in the form of the trace.
+/// A CAN frame as bytes, as the trace has it.
 pub(super) fn can_bytes(frame: &CanFrame) -> impl std::ops::Deref<Target = [u8]> {
     let id = match frame.id() {
         CanId::Standard(id) => u32::from(id),
         CanId::Extended(id) => id | 0x8000_0000,
     };
     let mut bytes = heapless::Vec::<u8, 12>::new();
-    // A frame has at most eight bytes.
+    // Cannot fail: a frame has at most eight bytes.
     let _ = bytes.extend_from_slice(&id.to_be_bytes());
     let _ = bytes.extend_from_slice(frame.data());
     bytes

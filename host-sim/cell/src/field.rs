@@ -53,7 +53,7 @@ impl Cell {
         }
     }
 
-    /// The port's receiver has bytes, which its driver reports at once or later.
+    /// The port's receiver got bytes; its driver reports them at once or later.
     fn hand_on(&mut self, id: LineId, owner: AnyPort, bytes: &[u8]) {
         let line = &mut self.lines[id.0];
         let Chunking::Gathered(every) = line.chunking else { return self.port_receives(owner, bytes) };
@@ -65,7 +65,7 @@ impl Cell {
         line.gathered.extend_from_slice(bytes);
     }
 
-    /// Reports the actions of a line's devices to the model.
+    /// Tells the model what the devices of a line did.
     pub(super) fn line_did(&mut self, id: LineId) {
         let line = &mut self.lines[id.0];
         let done = line.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
@@ -73,7 +73,7 @@ impl Cell {
         self.device_did(self.lines[id.0].owner, done);
     }
 
-    /// Reports the actions of a bus's devices to the model.
+    /// Tells the model what the devices of a bus did.
     pub(super) fn bus_did(&mut self, id: BusId) {
         let bus = &mut self.buses[id.0];
         let done = bus.device.as_mut().map_or_else(Vec::new, |device| device.take_done());
@@ -95,7 +95,7 @@ impl Cell {
         }
     }
 
-    /// Tells the model that bytes on a line differ from those that were sent.
+    /// Tells the model that bytes were corrupted on a line.
     pub(super) fn line_garbled(&mut self, id: LineId) {
         if let (AnyPort::Gateway(port), Some(oracle)) = (self.lines[id.0].owner, &mut self.oracle) {
             oracle.line_garbled(usize::from(port.0), self.now);

@@ -1,9 +1,9 @@
-//! A whole cell in virtual time: the gateway engine and the simulated controller, joined by
-//! simulated networks, RS-485 lines and CAN buses on one clock that jumps to the next deadline.
+//! A whole cell in virtual time: the gateway engine and the simulated controller, joined by simulated networks, RS-485
+//! lines and CAN buses. One clock jumps from deadline to deadline.
 //!
-//! In: a gateway configuration, a controller configuration and a seed. Out: everything that
-//! happens, the same for the same seed ([`Cell::trace`] has a digest to compare). Hours of a cell
-//! take seconds. Does not know sockets, devices or the host's clock (docs/cell.md).
+//! In: a gateway configuration, a controller configuration and a seed. Out: everything that happens, the same for the
+//! same seed ([`Cell::trace`] has a digest to compare). Hours of a cell take seconds. Does not know sockets, devices or
+//! the host's clock (docs/cell.md).
 //!
 //! ```
 //! use proto_core::time::Duration;
@@ -21,9 +21,10 @@
 //! assert_eq!(cell.value("DO[1]"), 1.0);
 //! ```
 //!
-//! Each fault is a method of [`Cell`] (such as [`Cell::refuse`] or [`Cell::half_open`]), a field of a
-//! [`Line`], a [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of
-//! [`Cell::controller_mut`]. [`FaultInjector`] injects all of them at random.
+//! Each fault is a method of [`Cell`] (such as [`Cell::refuse`] or [`Cell::half_open`]), a field of a [`Line`], a
+//! [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of [`Cell::controller_mut`]. [`FaultInjector`]
+//! injects
+//! all of them at random.
 
 mod access;
 mod can;
@@ -125,10 +126,10 @@ impl std::fmt::Display for CellError {
 
 impl std::error::Error for CellError {}
 
-/// A recipe port of the controller on a network.
+/// A recipe port of the controller that communicates over the network.
 #[derive(Debug)]
 struct Client {
-    /// The gateway's listening link that the port connects or sends to, if there is one.
+    /// The listening link of the gateway to which it connects or sends; `None` if there is none.
     link: Option<LinkId>,
     is_tcp: bool,
     conn: Option<u64>,
@@ -136,7 +137,7 @@ struct Client {
     socket: u64,
 }
 
-/// The cell.
+/// A cell.
 #[derive(Debug)]
 pub struct Cell {
     gateway: GatewayConfig,
@@ -144,11 +145,11 @@ pub struct Cell {
     engine_wake: Instant,
     controller: Controller,
     controller_wake: Instant,
-    /// The model has seen the controller's registers as they are.
+    /// The model has seen the current registers of the controller.
     controller_is_seen: bool,
     /// The earliest deadline of all devices.
     devices_wake: Instant,
-    /// Buffer for the engine's outputs; `None` while it is in use.
+    /// Buffer for what the engine sends; `None` while it is in use.
     buffer: Option<Box<[u8; OUTPUT_BUFFER]>>,
     now: Instant,
     queue: Queue<Due>,
@@ -156,7 +157,7 @@ pub struct Cell {
     conns: BTreeMap<u64, Connection>,
     next_conn: u64,
     clients: BTreeMap<usize, Client>,
-    /// The devices of ports that are connections.
+    /// The devices of field ports that are TCP connections.
     servers: BTreeMap<LinkId, tcp_device::TcpDevice>,
     lines: Vec<Line>,
     buses: Vec<CanBus>,
@@ -166,16 +167,16 @@ pub struct Cell {
     asleep: Option<sleep::Waiting>,
     wakes_at: Instant,
     stalls: u64,
-    /// Number of faults that each of the controller's servers has now.
+    /// Number of current faults of each of the controller's servers.
     server_faults: [u32; 3],
     rng: Rng,
     trace: Trace,
     recorder: Option<Recorder>,
     /// The model that checks everything; `None` before [`Cell::watch`].
     oracle: Option<Box<Oracle>>,
-    /// Judges what the device executes, in a cell of its own.
+    /// Judges what the device executes, in a cell that is made for that.
     judge: Option<Box<judge::Judge>>,
-    /// Changes the engine's inputs and outputs, so that the gateway breaks its promises.
+    /// Changes inputs and outputs of the engine, to simulate a gateway with faults.
     #[cfg(test)]
     corruption: Option<corruption::Corruption>,
     /// What the controller has sent on the connection of [`Cell::send_command`].
@@ -192,7 +193,7 @@ enum Medium {
 }
 
 impl Cell {
-    /// A cell that is switched on now. Field ports have no devices yet. Links come up when time advances.
+    /// A cell that is switched on now. Field ports have no devices yet. Links come up as time advances.
     ///
     /// # Errors
     /// [`CellError`] if the gateway or the controller cannot run its configuration.
@@ -204,7 +205,7 @@ impl Cell {
     /// [`Self::into_recording`].
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// The errors of [`Self::new`].
     pub fn recorded(gateway: &GatewayConfig, controller: &SimConfig, seed: u64) -> Result<Self, CellError> {
         Self::build(gateway, controller, seed, Some(Recorder::new(gateway)))
     }
@@ -285,7 +286,7 @@ impl Cell {
         self.oracle.as_ref().map_or(0, |oracle| oracle.writes)
     }
 
-    /// Frames in and out of a field port, counted across restarts of the gateway.
+    /// Number of frames received and sent on a field port, counted across restarts of the gateway.
     pub fn watched_frames(&self, port: PortId) -> (u64, u64) {
         let frames = self.oracle.as_ref().and_then(|oracle| oracle.frames.get(usize::from(port.0)));
         frames.copied().unwrap_or_default()
@@ -308,8 +309,8 @@ impl Cell {
         String::from_utf8_lossy(&self.reply).into_owned()
     }
 
-    /// Advances time until `done` returns true, or by `limit`; returns whether it did. `done` is called
-    /// every millisecond.
+    /// Advances time until `done` returns true, but at most by `limit`. Returns whether it did. `done` is called every
+    /// millisecond.
     pub fn run_until(&mut self, limit: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
         let end = self.now + limit;
         loop {
@@ -337,8 +338,9 @@ impl Cell {
     }
 }
 
-/// The gateway's address for the controller's UDP server: a new address each time the link is opened, as for a new
-/// socket.
+/// The gateway's address for the controller's UDP server. Each time the link is opened, the address changes, like that
+/// of
+/// a new socket.
 fn udp_peer(generation: u64) -> SocketAddr {
     (CLIENT_IP, 40_000 + (generation % 10_000) as u16).into()
 }
@@ -347,7 +349,7 @@ fn udp_peer(generation: u64) -> SocketAddr {
 const CLIENT_IP: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 /// The connection of [`Cell::send_command`].
 const COMMAND_CLIENT: ConnId = ConnId(u64::MAX);
-/// Neither zero nor on a grid of the engine, so that nothing can depend on the clock's origin.
+/// Neither zero nor on a time grid of the engine, so that nothing can depend on the origin of the clock.
 const START: Instant = Instant::from_micros(1_000_000_300);
 /// How long the controller's TCP client waits before it connects again.
 const CLIENT_RETRY: Duration = Duration::from_millis(250);

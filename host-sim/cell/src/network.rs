@@ -1,11 +1,11 @@
-//! The network between the gateway and the controller, as each link of the gateway sees it.
+//! The network between the gateway and the controller, with one model per link.
 
 use proto_core::engine::{LinkId, LinkKind};
 use proto_core::time::{Duration, Instant};
 
 use super::rng::Rng;
 
-/// The behaviour of one link's network.
+/// The behaviour of the network of one link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Network {
     /// Delay from one end to the other.
@@ -14,23 +14,24 @@ pub struct Network {
     pub jitter: Duration,
     /// Data sent on a connection is cut into segments of 1 to this many bytes, at random.
     pub longest_segment: Option<usize>,
-    /// A segment waits a random time up to this for the next segment, and arrives together with it.
+    /// A segment waits up to this long, at random, for the next one, and arrives together with it.
     pub merge: Duration,
     /// Number of datagrams per million that are lost.
     pub loss_ppm: u32,
     /// Number of datagrams per million that arrive twice.
     pub duplicate_ppm: u32,
-    /// The controller's TCP acknowledges this long after data has arrived, unless it sends something before.
+    /// The controller's TCP acknowledges this long after data has arrived, unless it sends something before that.
     pub ack_delay: Duration,
     /// The gateway's driver reports acknowledgements this long after they arrive, and before it reports received data.
     pub ack_report: Duration,
-    /// Capacity of the gateway's transport for unacknowledged bytes. If it is exceeded, the driver reports a
-    /// transmission as sent only once there is room again.
+    /// How many unacknowledged bytes the gateway's transport buffers. Beyond that, the driver reports a transmission as
+    /// sent
+    /// only when there is room again.
     pub send_buffer: u64,
 }
 
 impl Default for Network {
-    /// 200 µs, without splits and losses.
+    /// 200 µs of delay, nothing split, nothing lost.
     fn default() -> Self {
         Self {
             delay: Duration::from_micros(200),
@@ -47,7 +48,7 @@ impl Default for Network {
 }
 
 impl Network {
-    /// The longest time that a segment or datagram takes without faults.
+    /// The longest delay of a segment or datagram without faults.
     pub fn slowest(&self) -> Duration {
         self.delay + self.jitter + self.merge
     }
@@ -82,14 +83,14 @@ pub(super) enum ConnectPolicy {
     Silent,
 }
 
-/// One link as the network sees it.
+/// The network state of one link.
 #[derive(Debug)]
 pub(super) struct Gate {
     pub id: LinkId,
     pub kind: LinkKind,
     pub network: Network,
     pub connect_policy: ConnectPolicy,
-    /// Number of faults that cut each direction, by [`Way`].
+    /// Number of faults that currently cut each direction, by [`Way`].
     pub cuts: [u32; 2],
     pub is_open: bool,
     pub is_up: bool,
@@ -100,7 +101,7 @@ pub(super) struct Gate {
     pub is_full: bool,
     /// The driver will read the acknowledgements: [`super::due::Due::ReadAcks`] is queued.
     pub reads_acks: bool,
-    /// For a listening datagram link: the sender that the gateway replies to.
+    /// The sender that the gateway answers, if it listens for datagrams.
     pub answers_to: Option<Sender>,
     pub rng: Rng,
 }
@@ -153,7 +154,7 @@ impl Gate {
         self.answers_to = None;
     }
 
-    /// When a datagram that leaves now arrives: never, once or twice.
+    /// When a datagram sent now arrives; empty if it is lost, two instants if it is duplicated.
     pub(super) fn datagram_arrivals(&mut self, now: Instant, way: Way) -> Vec<Instant> {
         let Network { delay, jitter, loss_ppm, duplicate_ppm, .. } = self.network;
         if self.swallows(way) || self.rng.chance(loss_ppm) {
@@ -164,7 +165,7 @@ impl Gate {
     }
 }
 
-/// What travels on a connection.
+/// An item sent on a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Item {
     /// The other end has opened the connection.

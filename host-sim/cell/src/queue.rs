@@ -1,16 +1,15 @@
-//! A queue of events, ordered by time and, at one instant, by arrival.
+//! A queue of events, ordered by time and, at the same instant, by arrival.
 //!
-//! Only small entries are ordered; the events are not moved, which would take most of a cell's time.
+//! Only small keys are sorted, and the events stay in place: otherwise most of a cell's time would go into moving them.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use proto_core::time::Instant;
 
-/// The queue.
 #[derive(Debug)]
 pub(super) struct Queue<T> {
-    /// The earliest entry is on top.
+    /// The earliest key is on top.
     order: BinaryHeap<Reverse<Entry>>,
     things: Vec<Option<T>>,
     /// Free places in `things`.
@@ -18,7 +17,8 @@ pub(super) struct Queue<T> {
     pushed: u64,
 }
 
-/// An instant, a sequence number, and a place in `things`, in one number: one comparison orders two entries.
+/// A key: an instant, a number that grows with each entry, and a place in `things`. They are packed in one integer, so
+/// one comparison orders two keys.
 type Entry = u128;
 
 impl<T> Queue<T> {
@@ -62,7 +62,7 @@ impl<T> Queue<T> {
     }
 }
 
-/// More waiting events than the model allows; 2^40 can be pushed.
+/// Bits of a place: more places than the model ever lets wait at once. The other bits allow 2^40 pushes.
 const PLACE_BITS: u32 = 24;
 const MOST: usize = 1 << PLACE_BITS;
 

@@ -1,8 +1,10 @@
 //! A gateway that is not called for a while: its process is stopped, or its machine is busy or suspended. Everything
-//! else continues, and its input waits in buffers like a kernel's.
+//! else
+//! goes on, and its input waits in buffers like those of a kernel.
 //!
-//! Limits: 4 KiB per line, 256 frames per bus, 256 datagrams per link; more is lost. Connections lose nothing: data
-//! stays with the sender. The kernel still sends, acknowledges and retransmits what was sent before.
+//! The buffers hold 4 KiB per line, 256 frames per bus and 256 datagrams per link; more is lost. Connections lose
+//! nothing:
+//! data stays with the sender. The kernel still sends, acknowledges and retransmits what was sent before.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::time::Duration;
@@ -15,7 +17,7 @@ use super::{Cell, What};
 /// Events that wait for the gateway.
 #[derive(Debug, Default)]
 pub(super) struct Waiting {
-    /// The number of the stall: only the newest of several overlapping stalls wakes the gateway.
+    /// Number of the stall. If several overlap, only the newest one wakes the gateway.
     generation: u64,
     ports: Vec<(PortId, PortEvent)>,
     links: Vec<Due>,
@@ -33,7 +35,9 @@ pub(super) enum PortEvent {
 }
 
 impl Cell {
-    /// The gateway is not called for this long. Then it gets all waiting input, and a tick. Prolongs a present stall.
+    /// Stops calling the gateway for this long. After that it gets everything that waits, and a tick. Called during a
+    /// stall,
+    /// it prolongs the stall.
     pub fn stall_gateway(&mut self, span: Duration) {
         self.trace.add(self.now, What::Fault, super::Entry::GATEWAY, &span.as_micros().to_le_bytes());
         self.stalls += 1;
@@ -62,7 +66,7 @@ impl Cell {
         self.asleep.is_some()
     }
 
-    /// A stall ends.
+    /// Ends a stall, if it is still the newest one.
     pub(super) fn wake(&mut self, generation: u64) {
         if self.asleep.as_ref().is_none_or(|waiting| waiting.generation != generation) {
             return;
@@ -72,7 +76,7 @@ impl Cell {
         if let Some(judge) = &mut self.judge {
             judge.gateway_wakes(self.now);
         }
-        // The order in which a driver reads its sources is not specified.
+        // A driver may read its sources in any order.
         if self.rng.below(2) == 0 {
             self.report_port_events(ports);
             self.report_link_events(links);
@@ -117,7 +121,7 @@ impl Cell {
         }
     }
 
-    /// Keeps an event of a link for after the stall; returns it if it can be handled now.
+    /// Keeps an event of a link until the stall ends; returns it if it can be handled now.
     pub(super) fn keep_for_later(&mut self, due: Due) -> Option<Due> {
         let Some(waiting) = &mut self.asleep else { return Some(due) };
         let link = match &due {
@@ -171,9 +175,9 @@ impl Waiting {
     }
 }
 
-/// Number of bytes that a kernel keeps for a line.
+/// Number of bytes that a kernel buffers for a line.
 const LINE_BUFFER: usize = 4_096;
-/// Number of frames that a kernel keeps for a bus.
+/// Number of frames that a kernel buffers for a bus.
 const MAX_FRAMES: usize = 256;
-/// Number of datagrams that a kernel keeps for a socket.
+/// Number of datagrams that a kernel buffers for a socket.
 const MAX_DATAGRAMS: usize = 256;
