@@ -1,4 +1,4 @@
-//! The parts of a cell by name: what a test inspects and changes.
+//! Access to the parts of a cell by name, for tests that inspect and change them.
 
 use std::collections::BTreeMap;
 
@@ -39,7 +39,7 @@ impl Cell {
         &self.controller
     }
 
-    /// The controller, to inject faults. They take effect with the next [`Self::run`].
+    /// The controller, to inject faults, which take effect with the next [`Self::run`].
     pub fn controller_mut(&mut self) -> &mut Controller {
         self.controller_wake = self.now;
         self.controller_is_seen = false;
@@ -174,7 +174,7 @@ impl Cell {
         self.transmit(line, End::Device, bytes);
     }
 
-    /// Same, at a later instant.
+    /// As [`Self::send`], at a later instant.
     pub fn send_at(&mut self, at: Instant, line: LineId, bytes: &[u8]) {
         self.queue.push(at, Due::DeviceSends { line, bytes: bytes.to_vec() });
     }
@@ -189,7 +189,7 @@ impl Cell {
         &self.trace
     }
 
-    /// Keeps the next `limit` entries of the trace in full.
+    /// Keeps the next `limit` entries of the trace.
     pub fn keep_trace(&mut self, limit: usize) {
         self.trace.keep(limit);
     }

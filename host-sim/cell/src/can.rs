@@ -18,7 +18,7 @@ pub struct BusCounters {
     pub device_sent: u64,
     /// Frames sent by the port.
     pub port_sent: u64,
-    /// Frames that were lost on their way.
+    /// Frames that were lost on the bus.
     pub lost: u64,
 }
 
@@ -53,7 +53,7 @@ impl std::fmt::Debug for CanBus {
     }
 }
 
-/// A frame that has been transmitted.
+/// A frame that was transmitted over the bus.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Crossed {
     pub from: End,
@@ -81,13 +81,14 @@ impl CanBus {
         }
     }
 
-    /// The frames that the port has sent since the last call, each with the time of its end. The
-    /// newest [`MAX_HEARD`] are kept.
+    /// The frames that the port has sent since the last call, each with the time of its end. The newest [`MAX_HEARD`]
+    /// are
+    /// kept.
     pub fn take_heard(&mut self) -> Vec<(Instant, CanFrame)> {
         self.heard.drain(..).collect()
     }
 
-    /// Queues a frame. Returns when the frame that starts on the bus now ends; `None` if none starts.
+    /// Queues a frame. If a frame starts on the bus now, returns when it ends; otherwise `None`.
     pub(super) fn send(&mut self, now: Instant, from: End, frame: CanFrame) -> Option<Instant> {
         self.waiting[from as usize].push_back(frame);
         match from {
@@ -111,8 +112,8 @@ impl CanBus {
         Some(Crossed { from, frame, arrives, was_last: self.waiting[from as usize].is_empty() })
     }
 
-    /// Lower ids win the bus, and a data frame wins over a remote one. Returns when the winning
-    /// frame ends; `None` if the bus is busy or no frame waits.
+    /// Arbitration: the lowest id wins, and a data frame wins over a remote frame. Returns when the winning frame ends;
+    /// `None` if the bus is busy or no frame waits.
     pub(super) fn arbitrate(&mut self, now: Instant) -> Option<Instant> {
         if self.on_the_bus.is_some() {
             return None;

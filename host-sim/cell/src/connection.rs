@@ -1,4 +1,4 @@
-//! TCP connections between the gateway and the controller or a device, both directions of each.
+//! TCP connections between the gateway and the controller or a device, with both directions.
 
 use std::collections::VecDeque;
 
@@ -28,7 +28,7 @@ pub(super) struct Connection {
     pub peer: Peer,
     pub up: Pipe,
     pub down: Pipe,
-    /// The controller knows of the connection.
+    /// The controller has accepted the connection.
     pub accepted: bool,
     /// The controller has closed its end.
     pub closing: bool,
@@ -40,7 +40,8 @@ pub(super) struct Connection {
     pub owes_ack: bool,
     /// The gateway's transport will check for a timeout: [`super::due::Due::UserTimeout`] is queued.
     pub is_watched: bool,
-    /// Entries for the device's log: the bytes that must have arrived before, and when the last of them left.
+    /// Log entries of a device, each with the number of bytes that must have arrived before it, and when the last was
+    /// sent.
     pub acts: VecDeque<(u64, Instant, Act)>,
 }
 

@@ -1,11 +1,11 @@
-//! Gateways that break their promises: inputs and outputs of the engine are changed, and the model has to report it.
+//! Gateways with faults: inputs and outputs of the engine are changed on their way, and the model has to report it.
 
 use proto_core::engine::{Endpoint, Input, LinkId, Output, PortId, Transport};
 use proto_core::time::Instant;
 
 use super::Cell;
 
-/// An output that did not come from the engine.
+/// An output that replaces one of the engine's.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Forged {
     Link(LinkId, Vec<u8>),
@@ -13,9 +13,9 @@ pub(super) enum Forged {
     Open(LinkId),
 }
 
-/// Returns the bytes that replace the input's; `None` leaves the input as it is.
+/// Returns bytes for the engine that replace those of the input. `None` leaves the input unchanged.
 pub(super) type Inward = Box<dyn FnMut(Instant, &Input<'_>) -> Option<Vec<u8>>>;
-/// Returns what replaces an output, or precedes a `Sleep`; `None` leaves the output as it is.
+/// Returns outputs that replace an output, or precede a `Sleep`. `None` leaves the output unchanged.
 pub(super) type Outward = Box<dyn FnMut(Instant, &Input<'_>, &Output<'_>) -> Option<Vec<Forged>>>;
 
 /// The changes to inputs and outputs.

@@ -4,7 +4,7 @@ use proto_core::time::{Duration, Instant};
 
 /// A device: `M` is `Vec<u8>` on an RS-485 line and a CAN frame on a bus.
 ///
-/// Returned messages are sent in order, each as soon as the device's previous one has left.
+/// Returned messages are sent in order, each as soon as the device's previous message was sent.
 pub trait Device<M> {
     /// A message arrived: a chunk of bytes as the line delivers it, or a CAN frame.
     fn receive(&mut self, now: Instant, message: &M) -> Vec<M> {
@@ -23,19 +23,21 @@ pub trait Device<M> {
         Vec::new()
     }
 
-    /// The actions of polled devices since the last call, in order. The model compares the gateway's values with them.
+    /// What the devices that answer requests did since the last call, in order. The model compares the gateway's values
+    /// with it.
     fn take_done(&mut self) -> Vec<SlaveDone> {
         Vec::new()
     }
 }
 
-/// A device that is a TCP server, such as of Modbus TCP. It has one connection at a time: a new connection replaces the
-/// previous one.
+/// A device that is a TCP server, such as a Modbus TCP server. It has one connection at a time: a new connection
+/// replaces
+/// the previous one.
 pub trait Server {
     /// A connection was opened.
     fn opened(&mut self, now: Instant);
 
-    /// The connection is gone, and its unsent data is lost.
+    /// The connection is gone; data that was not sent yet is lost.
     fn closed(&mut self, now: Instant);
 
     /// Bytes arrived on the connection, in pieces of any size.
@@ -47,73 +49,75 @@ pub trait Server {
     /// The deadline has come; the next one must be later than `now`.
     fn poll(&mut self, now: Instant) -> Vec<Served>;
 
-    /// The entries of its log since the last call, in order.
+    /// What the device did since the last call, in order.
     fn take_done(&mut self) -> Vec<SlaveDone>;
 }
 
-/// An entry in a device's own log.
+/// An entry in a device's own log of what it did.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Act {
-    /// It received a whole request in its own format: an order or a query.
+    /// The device received a complete request: an order, or a query (`None`).
     Heard(Option<Order>),
-    /// It executed an order with these values.
+    /// The device executed an order with these values.
     Did(Order, Vec<u32>),
-    /// It refused an order with a code.
+    /// The device refused an order with a code.
     Refused(Order, u8),
-    /// A reply was sent, or was due but not sent.
+    /// A reply was sent, or was not sent although it was due.
     Replied {
-        /// The order that was replied to, if any.
+        /// The order that is replied to, if it is a reply to an order.
         order: Option<Order>,
         /// The reply differs from the request, so it cannot be taken for an echo.
         tells: bool,
-        /// The reply was sent unchanged.
+        /// The reply was sent without changes.
         is_whole: bool,
-        /// The reply was certainly at the gateway in time.
+        /// The reply also certainly arrived at the gateway in time.
         in_time: bool,
     },
-    /// Something that is not a reply arrived from the device; the gateway may or may not take it for a sign of life.
+    /// The gateway received something from the device that is no reply to the request. It may or may not count as a
+    /// sign that
+    /// the device is up.
     Garbled,
-    /// The variable with this number has this value from now on.
+    /// From now on, the value with this number is this.
     Holds(usize, u16),
-    /// It lost its power, and everything that it was told.
+    /// The device lost its power, and with it everything it was told.
     PowerOff,
-    /// It has power again.
+    /// The device has power again.
     PowerOn,
 }
 
 /// What a device can be ordered to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Order {
-    /// To move: an event.
+    /// Move: an event.
     Move,
-    /// The second step of a dialogue that began with [`Self::Move`].
+    /// The second step of an exchange that began with [`Self::Move`].
     Step,
-    /// To stop.
+    /// Stop.
     Stop,
-    /// What it gets at its start, and what moves it: homing, a mode.
+    /// What is sent at the start of the device and also makes it move: homing, a mode.
     Start,
-    /// A value that it stores.
+    /// A value that the device stores.
     Keep,
 }
 
 /// An action of a TCP server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Served {
-    /// It sends bytes. The act is logged once the last byte has arrived.
+    /// Sends bytes. The act is logged once the last of them has arrived.
     Bytes(Vec<u8>, Option<Act>),
-    /// It closes its connection, in both directions.
+    /// Closes the connection, in both directions.
     Close,
-    /// It closes its sending side, and still receives.
+    /// Sends nothing more on the connection, but still receives.
     HalfClose,
-    /// It resets its connection.
+    /// Resets the connection.
     Reset,
-    /// It loses its power: its connection disappears without notice.
+    /// Loses power: the connection is gone, and no end is told.
     PowerOff,
-    /// It has power again.
+    /// Has power again.
     PowerOn,
 }
 
-/// An action of a polled device: a slave of a Modbus line, or a peer with frames of its own.
+/// An action of a device that answers requests: a slave on a Modbus line, or a peer with frames of its own.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlaveDone {
     /// Address or number of the device.
@@ -125,41 +129,42 @@ pub struct SlaveDone {
 /// An action of a slave.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Done {
-    /// It made a reply, which may be changed or lost before it is sent.
+    /// The slave made a reply, which may be changed or lost before it is sent.
     Answered {
         /// The first register or coil that was read or written.
         address: u16,
-        /// Number of registers or coils.
+        /// The number of registers or coils.
         count: u16,
         /// The whole frame.
         reply: Vec<u8>,
     },
-    /// It accepted values, from a request to itself or to all.
+    /// The slave accepted values, from a request to itself or a broadcast.
     Wrote {
-        /// Coils, otherwise holding registers.
+        /// Whether they are coils; otherwise they are holding registers.
         coils: bool,
         /// The first register or coil.
         address: u16,
         /// The registers, or 0 and 1 for coils.
         values: Vec<u16>,
     },
-    /// It made a frame of its own, which may be changed or lost before it is sent: a reply, or an unsolicited frame.
+    /// The peer made a frame of its own, which may be changed or lost before it is sent: a reply, or an unsolicited
+    /// frame.
     Replied {
         /// The exchange, counted from 0 on the port.
         exchange: usize,
         /// The whole frame.
         frame: Vec<u8>,
     },
-    /// It took a request of its own frames.
+    /// The peer accepted a request with a frame of its own.
     Took {
         /// The exchange, counted from 0 on the port.
         exchange: usize,
         /// The whole frame.
         request: Vec<u8>,
     },
-    /// It lost its power, and with it everything that was written.
+    /// The slave lost its power, and with it everything that was written.
     Forgot,
-    /// An entry in the log of a device of a judged cell.
+    /// An entry in the log of the device in a judged cell.
     Acted(Act),
 }
 

@@ -59,7 +59,7 @@ pub(super) enum Due {
         line: LineId,
         chunk: Chunk,
     },
-    /// Bytes gathered by the line are reported.
+    /// Bytes that a line has gathered are reported.
     Gathered {
         line: LineId,
     },

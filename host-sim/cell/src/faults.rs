@@ -1,4 +1,4 @@
-//! Faults that a test or a soak run can inject, and how they are repaired.
+//! Faults that a test or a soak run can inject, and their repair.
 
 use proto_core::engine::{BusState, Engine, Input, LinkId, LinkKind};
 
@@ -42,7 +42,7 @@ impl Cell {
         }
     }
 
-    /// Nothing arrives any more in this direction until [`Self::release`]; nothing is lost.
+    /// Holds back everything in this direction until [`Self::release`]; nothing is lost.
     pub fn hold(&mut self, link: LinkId, way: Way) {
         self.note(link);
         if let Some(conn) = self.connection(link) {
@@ -64,7 +64,8 @@ impl Cell {
         }
     }
 
-    /// Everything sent in this direction is lost until [`Self::repair_way`] is called as often. TCP retransmits it.
+    /// Everything sent in this direction is lost until [`Self::repair_way`] has been called as often as this. TCP
+    /// retransmits it.
     pub fn cut_way(&mut self, link: LinkId, way: Way) {
         self.note(link);
         self.gate(link).cuts[way as usize] += 1;
@@ -77,7 +78,7 @@ impl Cell {
         *cuts = cuts.saturating_sub(1);
     }
 
-    /// Pulls the cable between gateway and controller, as far as this link is concerned.
+    /// Pulls the cable between the gateway and the controller, for this link only.
     pub fn cut_cable(&mut self, link: LinkId) {
         Way::BOTH.into_iter().for_each(|way| self.cut_way(link, way));
     }
@@ -94,8 +95,8 @@ impl Cell {
         self.queue.push(self.now, due);
     }
 
-    /// The connection is gone and neither end is told: data that they send is lost. TCP gives it up
-    /// after [`TCP_TIMEOUT`].
+    /// Makes the connection half-open: neither end is told, and data that they send is lost. TCP gives up after
+    /// [`TCP_TIMEOUT`].
     pub fn half_open(&mut self, link: LinkId) {
         self.note(link);
         let Some(id) = self.gate(link).conn else { return };
@@ -111,7 +112,7 @@ impl Cell {
         self.gates.get(&link).is_some_and(|gate| gate.conn.is_some())
     }
 
-    /// The next state packet lacks its first bytes, and the connection continues: all later packets are misaligned.
+    /// The next state packet lacks its first bytes. The connection continues, so all later packets are misaligned.
     pub fn lose_state_bytes(&mut self, count: usize) {
         self.note(LinkId::STATE);
         self.state_bytes_lost = count;
@@ -122,7 +123,7 @@ impl Cell {
         self.gate(link).connect_policy = connect_policy;
     }
 
-    /// A note in the trace.
+    /// Adds a remark to the trace.
     pub(super) fn remark(&mut self, words: std::fmt::Arguments<'_>) {
         self.trace.remark(self.now, words);
     }
@@ -165,7 +166,7 @@ impl Cell {
         self.lines[line.0].connected = self.lines[line.0].is_plugged;
     }
 
-    /// The port's adapter is pulled out: its owner is told.
+    /// The port's adapter is unplugged, which is reported to the owner of the port.
     pub fn unplug(&mut self, line: LineId) {
         self.cut(line);
         self.lines[line.0].is_plugged = false;
@@ -173,7 +174,7 @@ impl Cell {
         self.port_input(self.lines[line.0].owner, false);
     }
 
-    /// The adapter is back.
+    /// The port's adapter is plugged in again.
     pub fn plug_in(&mut self, line: LineId) {
         self.lines[line.0].is_plugged = true;
         self.repair(line);
@@ -207,7 +208,7 @@ impl Cell {
     }
 
     fn bus_state(&mut self, bus: BusId, state: BusState) {
-        // The simulated controller's own CAN port has no error states.
+        // The CAN ports of the simulated controller have no error states.
         if let AnyPort::Gateway(port) = self.buses[bus.0].owner {
             self.report_port_event(port, PortEvent::Bus(state));
         }
@@ -224,7 +225,7 @@ impl Cell {
         self.controller_started();
     }
 
-    /// As [`Self::restart_controller`], with all registers at 0.
+    /// As [`Self::restart_controller`], with all registers set to 0.
     pub fn clear_controller(&mut self) {
         let now = self.now;
         self.trace.add(now, What::Fault, Entry::CONTROLLER, &[0]);
@@ -232,7 +233,8 @@ impl Cell {
         self.controller_started();
     }
 
-    /// The controller loses power: its ends of all connections are gone without notice. [`Self::power_up`] ends it.
+    /// The controller loses power: its ends of all connections disappear without notice. [`Self::power_up`] ends the
+    /// power cut.
     pub fn power_cut(&mut self) {
         let links: Vec<LinkId> = self.controller_links().collect();
         links.into_iter().for_each(|link| self.cut_cable(link));
@@ -241,14 +243,14 @@ impl Cell {
         self.lose_power(conns);
     }
 
-    /// The far ends of connections are gone without notice.
+    /// The far ends of these connections disappear without notice.
     pub(super) fn lose_power(&mut self, conns: Vec<(u64, Peer)>) {
         for (id, peer) in conns {
             let Some(conn) = self.conns.get_mut(&id) else { continue };
             match peer {
                 _ if conn.forgotten => continue,
                 _ if conn.abandoned || conn.closing => drop(self.drop_conn(id)),
-                // The gateway keeps trying to connect.
+                // The gateway repeats its connection request.
                 Peer::Server(_) | Peer::Device if !conn.accepted => continue,
                 Peer::Client(_) if !conn.accepted => {
                     let link = conn.link;
@@ -330,7 +332,7 @@ impl Cell {
         self.gates.values().filter(move |gate| is_tcp(gate.kind)).map(|gate| gate.id)
     }
 
-    /// The links without connections.
+    /// The links that use datagrams.
     pub fn datagram_links(&self) -> impl Iterator<Item = LinkId> + use<> {
         let is_udp = |kind| matches!(kind, LinkKind::RecipeUdp | LinkKind::RecipeUdpListen { .. });
         let links: Vec<LinkId> =

@@ -1,4 +1,4 @@
-//! Unreadable values of the controller: NaN or infinite in its state packets and recipe frames.
+//! Unreadable values: NaN or infinity in state packets and recipe frames of the controller.
 
 use proto_core::config::{FieldSpec, Parts, StreamPart};
 use proto_core::engine::LinkId;
@@ -8,22 +8,22 @@ use proto_core::wire::scalar::ScalarType;
 use super::{Cell, Entry, What};
 
 impl Cell {
-    /// The controller sends `value` for this variable from now on, whatever its register contains.
+    /// From now on, the controller sends `value` for this variable, whatever its register contains.
     pub fn corrupt_float(&mut self, var: SysVar, value: f32) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &value.to_le_bytes());
-        // A variable that is not a float is not changed.
+        // Does nothing if the variable is not a float.
         let _ = self.controller_mut().corrupt(&var.to_string(), value);
         self.note_fault(None);
     }
 
-    /// The controller sends the register's value again.
+    /// From now on, the controller sends the value of the register again.
     pub fn heal(&mut self, var: SysVar) {
         self.trace.add(self.now, What::Fault, Entry::CONTROLLER, &[]);
         let _ = self.controller_mut().heal(&var.to_string());
         self.note_fault(None);
     }
 
-    /// The floats that the gateway's configuration names.
+    /// The float variables in the gateway's configuration.
     pub fn floats(&self) -> Vec<SysVar> {
         let named = |var: &SysVar| {
             self.gateway.fields.iter().any(|field| field.variables().any(|bound| bound == *var))

@@ -12,22 +12,22 @@ use super::{AnyPort, End};
 /// How the receiver's driver reports bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Chunking {
-    /// Each transmission in one piece, when its last byte has arrived.
+    /// Each transmission as a whole, when its last byte has arrived.
     Whole,
     /// In pieces of this many bytes, each when its last byte has arrived.
     Pieces(usize),
     /// In pieces of 1 to this many bytes.
     Random(usize),
-    /// Like a USB adapter: received bytes are buffered and reported at each multiple of this time.
+    /// Like a USB adapter: received bytes are buffered and reported at each multiple of this duration.
     Gathered(Duration),
 }
 
-/// How the two ends are joined.
+/// How the two ends are wired.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wiring {
-    /// Both use one pair: simultaneous transmissions are garbled for both.
+    /// Both ends share one pair: simultaneous transmissions corrupt each other.
     TwoWire,
-    /// A pair for each direction, as on a pseudoterminal.
+    /// Each direction has its own pair, as on a pseudoterminal.
     FourWire,
 }
 
@@ -36,17 +36,17 @@ pub enum Wiring {
 pub struct LineCounters {
     /// Transmissions of the device.
     pub device_sent: u64,
-    /// Bytes of the device's transmissions.
+    /// Bytes that the device sent.
     pub device_bytes: u64,
     /// Transmissions of the port.
     pub port_sent: u64,
-    /// Bytes of the port's transmissions.
+    /// Bytes that the port sent.
     pub port_bytes: u64,
     /// Transmissions that began while the other end was sending.
     pub overlaps: u64,
-    /// Bytes that were changed on their way.
+    /// Bytes that were corrupted on the line.
     pub garbled_bytes: u64,
-    /// Bytes that were lost on their way.
+    /// Bytes that were lost on the line.
     pub lost_bytes: u64,
 }
 
@@ -72,7 +72,7 @@ pub struct Line {
     collision: (Instant, Instant),
     heard: VecDeque<(Instant, Vec<u8>)>,
     pub(super) keep_heard: usize,
-    /// Bytes gathered and not reported yet.
+    /// Bytes that were gathered but not reported yet.
     pub(super) gathered: Vec<u8>,
     rng: Rng,
 }
@@ -131,13 +131,14 @@ impl Line {
         self.busy_until[End::Device as usize]
     }
 
-    /// The transmissions of the port since the last call, each with the time of its last byte. The
-    /// newest [`MAX_HEARD`] are kept.
+    /// The transmissions of the port since the last call, each with the time of its last byte. The newest [`MAX_HEARD`]
+    /// are
+    /// kept.
     pub fn take_heard(&mut self) -> Vec<(Instant, Vec<u8>)> {
         self.heard.drain(..).collect()
     }
 
-    /// Starts a transmission on the line; `each` gets the time at which each piece has arrived, in order.
+    /// Starts a transmission on the line. `each` gets the arrival time of each piece, in order.
     pub(super) fn send(
         &mut self,
         now: Instant,
@@ -216,7 +217,7 @@ impl Line {
         self.heard.push_back((now, bytes.to_vec()));
     }
 
-    /// The time that this many bytes take.
+    /// The transmission time of this many bytes.
     pub fn time_of(&self, len: usize) -> Duration {
         self.settings.time_on_line(len)
     }

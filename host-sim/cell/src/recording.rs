@@ -1,5 +1,5 @@
-//! A recording of all inputs and outputs of the cell's engine, in the format of `proto_core::record`, to
-//! be replayed on another machine (docs/cortex-m7.md section 1).
+//! A recording of all inputs and outputs of the cell's engine, in the format of `proto_core::record`, to be replayed on
+//! another machine (docs/cortex-m7.md section 1).
 
 use proto_core::config::GatewayConfig;
 use proto_core::engine::{Engine, Input, Output};
@@ -50,8 +50,9 @@ impl Recorder {
     }
 }
 
-/// The first difference of two recordings as text: the entry, the input before it, and both contents.
-/// `None` if they are equal.
+/// The first difference between two recordings as text: the entry, the input before it, and both contents. `None` if
+/// the
+/// recordings are equal.
 pub fn recording_difference(expected: &[u8], found: &[u8]) -> Option<String> {
     if expected == found {
         return None;

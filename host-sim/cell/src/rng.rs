@@ -1,7 +1,7 @@
-//! The cell's random numbers.
+//! The random numbers of a cell.
 //!
-//! SplitMix64, written out: a seed in a report must always mean the same run, and no crate in the
-//! dependency tree promises its sequence across versions.
+//! This is SplitMix64, implemented here: a seed in a report must always reproduce the same run, and no crate in the
+//! dependency tree promises the same sequence across versions.
 
 use proto_core::time::Duration;
 
@@ -10,7 +10,7 @@ use proto_core::time::Duration;
 pub struct Rng(u64);
 
 impl Rng {
-    /// The generator of this seed.
+    /// A generator with this seed.
     pub const fn new(seed: u64) -> Self {
         Self(seed)
     }
@@ -30,17 +30,17 @@ impl Rng {
         ((u128::from(self.next_u64()) * u128::from(bound)) >> 64) as u64
     }
 
-    /// A number from `low` to `high`, both included.
+    /// A number from `low` to `high`, both inclusive.
     pub fn between(&mut self, low: u64, high: u64) -> u64 {
         low + self.below(high.saturating_sub(low).saturating_add(1))
     }
 
-    /// True with this probability, in millionths.
+    /// True with a probability of `per_million` millionths.
     pub fn chance(&mut self, per_million: u32) -> bool {
         per_million > 0 && self.below(1_000_000) < u64::from(per_million)
     }
 
-    /// A time up to `most`, which is included.
+    /// A duration from zero to `most`, inclusive.
     pub fn up_to(&mut self, most: Duration) -> Duration {
         Duration::from_micros(self.between(0, most.as_micros()))
     }
@@ -50,7 +50,7 @@ impl Rng {
         (0..len).map(|_| self.next_u64() as u8).collect()
     }
 
-    /// A separate generator for a part of the cell: the numbers drawn by one part do not change those of another.
+    /// A separate generator for a part of the cell. What one part draws then does not affect what another part draws.
     #[must_use]
     pub fn fork(&mut self) -> Self {
         Self(self.next_u64())

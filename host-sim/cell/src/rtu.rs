@@ -1,12 +1,13 @@
-//! The checksum of Modbus RTU, from proto-core/docs/wire/modbus-rtu.md, independent of the engine's: for the model and
-//! the devices of a soak run.
+//! The CRC of Modbus RTU, from proto-core/docs/wire/modbus-rtu.md: for the model and the simulated devices of a soak
+//! run,
+//! independent of the engine's implementation.
 
 /// A frame with its CRC, the low byte first.
 pub(crate) fn sealed(bytes: &[u8]) -> Vec<u8> {
     [bytes, &crc(bytes)].concat()
 }
 
-/// The CRC, low byte first.
+/// The CRC, the low byte first.
 fn crc(bytes: &[u8]) -> [u8; 2] {
     let crc = bytes.iter().fold(0xFFFF_u16, |crc, &byte| {
         (0..8).fold(crc ^ u16::from(byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })

@@ -1,4 +1,4 @@
-//! The present state of the paths to the controller, from which the model derives what should have arrived.
+//! Determines which paths to the controller work at present, because the model has to know what should have arrived.
 
 use proto_core::engine::{LinkId, LinkKind};
 use proto_core::time::Duration;
@@ -11,14 +11,15 @@ use super::oracle::{Path, inputs_of};
 use recipe_controller::Link;
 
 impl Cell {
-    /// Announces that a server of the controller has a fault, such as [`recipe_controller::Controller::mute`], so that
-    /// the model expects less of the gateway. Call [`Self::server_fault_ends`] as often.
+    /// Announces that a server of the controller has a fault, such as [`recipe_controller::Controller::mute`], so the
+    /// model
+    /// expects less of the gateway. Call [`Self::server_fault_ends`] once for each call.
     pub fn server_fault_begins(&mut self, server: Link) {
         self.server_faults[server as usize] += 1;
         self.note_fault(None);
     }
 
-    /// Announces that the fault has ended.
+    /// Announces that a fault of a server has ended.
     pub fn server_fault_ends(&mut self, server: Link) {
         let server_faults = &mut self.server_faults[server as usize];
         *server_faults = server_faults.saturating_sub(1);
@@ -47,7 +48,7 @@ impl Cell {
         self.queue.push(now + SURVEY_EVERY, Due::Survey);
     }
 
-    /// The controller sends on a connection: checks for a command that it did not understand.
+    /// Checks data that the controller sends on a connection for its reply to an unknown command.
     pub(super) fn replied(&mut self, conn: u64, bytes: &[u8]) {
         if let Some(judge) = &mut self.judge {
             judge.answered(conn, bytes, self.now);
@@ -100,6 +101,6 @@ impl Cell {
 }
 
 const SURVEY_EVERY: Duration = Duration::from_millis(100);
-/// Nothing is expected of a worse network.
+/// The model expects nothing of a network with at least this loss (per million) or jitter.
 const MUCH_LOSS: u32 = 10_000;
 const MUCH_JITTER: Duration = Duration::from_millis(5);

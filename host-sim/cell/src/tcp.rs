@@ -1,9 +1,10 @@
-//! One direction of a TCP connection: data arrives once and in order, or not at all. Data lost in the network is
-//! retransmitted after growing delays.
+//! One direction of a TCP connection. Data arrives once and in order, or not at all; data lost in the network is
+//! retransmitted after growing pauses.
 //!
-//! In: what the sender sends, and whether the path is cut. Out: when something arrives or is
-//! retransmitted. Does not model windows or congestion: after a loss everything waits for the next
-//! retransmission, as in a real stack while nothing is acknowledged.
+//! In: the sent data, and whether the path is cut. Out: when something arrives or is retransmitted. Does not know
+//! windows
+//! or congestion: after a loss everything waits for the next retransmission, as in a real stack while nothing is
+//! acknowledged.
 
 use std::collections::VecDeque;
 
@@ -25,9 +26,9 @@ pub(super) struct Pipe {
     pub reset_after: Option<usize>,
     /// Number of bytes that were sent.
     pub sent: u64,
-    /// Number of these that have arrived.
+    /// Number of sent bytes that have arrived.
     pub arrived: u64,
-    /// Number of these that the sender knows to be acknowledged.
+    /// Number of sent bytes that the sender knows to be acknowledged.
     pub acked: u64,
     /// When the oldest unacknowledged byte was sent, or the newest acknowledgement came.
     pub unacked_since: Instant,
@@ -40,9 +41,9 @@ pub(super) struct Pipe {
 #[derive(Debug)]
 struct Segment {
     sent_at: Instant,
-    /// [`Instant::NEVER`] if it was lost.
+    /// When the segment arrives; [`Instant::NEVER`] if it was lost.
     arrives: Instant,
-    /// Number of bytes of the other direction that it acknowledges.
+    /// Number of bytes of the other direction that the segment acknowledges.
     acks: u64,
     item: Item,
 }
@@ -88,7 +89,7 @@ impl Pipe {
         }
     }
 
-    /// Sends an item; `arrives` gets the arrival of each of its segments. None arrives while an earlier segment is
+    /// Sends an item. `arrives` gets the arrival time of each of its segments; it gets none while an earlier segment is
     /// lost.
     pub(super) fn send(
         &mut self,
@@ -118,7 +119,7 @@ impl Pipe {
             let late = gate.rng.up_to(network.jitter) + gate.rng.up_to(network.merge);
             let mut at = (now + network.delay + late).max(self.newest);
             if network.longest_segment.is_some() && at == self.newest {
-                // Segments that arrive at one instant would be received as one.
+                // Segments that arrive at the same instant would be received as one.
                 at += Duration::from_micros(1);
             }
             self.newest = at;
@@ -139,8 +140,9 @@ impl Pipe {
         }
     }
 
-    /// Removes the next item that has arrived; bytes that arrived together are one piece. Also returns how many bytes
-    /// of the other direction are acknowledged.
+    /// Takes the next item that has arrived; bytes that arrived together are one item. Also returns how many bytes of
+    /// the
+    /// other direction are acknowledged.
     pub(super) fn next_arrived(&mut self, now: Instant) -> (Arrived, u64) {
         let mut acks = 0;
         if self.held || self.dead {
@@ -179,7 +181,7 @@ impl Pipe {
         (Arrived::Item(Item::Bytes(joined)), acks)
     }
 
-    /// Loses everything that would arrive now; returns the retransmission time, if it is new.
+    /// Loses the data that would arrive now. Returns when it is retransmitted, if that was not known yet.
     pub(super) fn lose(&mut self, now: Instant) -> Option<Instant> {
         let mut first = None;
         for segment in self.segments.iter_mut().filter(|segment| segment.arrives <= now) {
@@ -189,7 +191,7 @@ impl Pipe {
         self.schedule_retransmission(now, first?)
     }
 
-    /// Handles a missing acknowledgement of data sent at `sent_at`; returns the retransmission time, if it is new.
+    /// Data sent at `sent_at` was not acknowledged. Returns when it is retransmitted, if that was not known yet.
     pub(super) fn schedule_retransmission(&mut self, now: Instant, sent_at: Instant) -> Option<Instant> {
         if self.retransmit_at.is_some() {
             return None;
@@ -210,7 +212,7 @@ impl Pipe {
         if !any_lost && self.unacked() == 0 {
             return Retransmission::Nothing;
         }
-        // If only acknowledgements were lost, arrived data is retransmitted to get them again.
+        // If only acknowledgements were lost, data that has arrived is retransmitted to get them again.
         if gate.is_cut(way) || !any_lost && gate.is_cut(way.back()) {
             self.rto = self.rto.saturating_mul(2);
             if self.rto > MAX_RTO {
@@ -236,7 +238,7 @@ impl Pipe {
         self.newest = Instant::ZERO;
     }
 
-    /// Handles an acknowledgement; returns whether it covers more than the previous one.
+    /// The sender receives an acknowledgement. Returns whether it covers more than the previous one.
     pub(super) fn acknowledge(&mut self, now: Instant, upto: u64) -> bool {
         let is_news = upto > self.acked;
         if is_news {
@@ -261,7 +263,7 @@ impl Pipe {
 const INITIAL_RTO: Duration = Duration::from_secs(1);
 /// The retransmission timeout after data has arrived. Each retransmission doubles it.
 const MIN_RTO: Duration = Duration::from_millis(200);
-/// Maximum retransmission timeout; beyond it the connection is given up.
+/// A connection that would need a longer retransmission timeout is given up.
 const MAX_RTO: Duration = Duration::from_secs(16);
 /// Maximum number of bytes per read of a program, rounded up to a segment.
 const MAX_READ: usize = 16 * 1024;

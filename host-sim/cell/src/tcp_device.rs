@@ -1,7 +1,6 @@
-//! Devices of ports that are TCP connections: the device's end of the connection.
+//! Devices of field ports that are TCP connections: the far end of such a connection.
 //!
-//! The gateway's end and all faults of the network are the same as for every link ([`super::network`],
-//! [`super::faults`]).
+//! The gateway's end, and all faults of the network, work as on every link ([`super::network`], [`super::faults`]).
 
 use proto_core::engine::LinkId;
 use proto_core::time::{Duration, Instant};
@@ -16,10 +15,10 @@ use super::network::{ConnectPolicy, Gate, Item, Way};
 #[derive(Default)]
 pub(super) struct TcpDevice {
     server: Option<Box<dyn Server>>,
-    /// Its connection.
+    /// Its current connection.
     conn: Option<u64>,
     is_off: bool,
-    /// Since when the gateway could have had a connection but has none; `None` if it has one or could not.
+    /// Since when the gateway has had no connection although it could; `None` if it has one, or could have none.
     missed_since: Option<Instant>,
 }
 
@@ -38,7 +37,8 @@ impl TcpDevice {
 
 impl Cell {
     /// Attaches a device to a Modbus TCP link; it replaces the previous device. Without a device, connections are
-    /// accepted but nobody replies.
+    /// accepted
+    /// but never answered.
     ///
     /// # Panics
     /// If the link does not lead to a device.
@@ -51,7 +51,7 @@ impl Cell {
         self.note_deadlines();
     }
 
-    /// Calls the device of a link, then reads its log.
+    /// Lets `act` use the device of a link, then reads the device's log.
     fn with_server(&mut self, link: LinkId, act: impl FnOnce(&mut dyn Server)) {
         let device = self.servers.get_mut(&link).and_then(|device| device.server.as_mut());
         let Some(server) = device else { return };
@@ -68,7 +68,7 @@ impl Cell {
         }
     }
 
-    /// The link of a connection, if the connection is the one that the device has.
+    /// The link of a connection, if it is the current connection of its device.
     fn device_of(&self, id: u64) -> Option<LinkId> {
         let link = self.conns.get(&id).map(|conn| conn.link);
         link.filter(|link| self.servers.get(link).is_some_and(|device| device.conn == Some(id)))
@@ -79,7 +79,7 @@ impl Cell {
         let Some(device) = self.servers.get_mut(&link) else { return };
         device.missed_since = None;
         if let Some(before) = device.conn.replace(id) {
-            // The gateway has left the old connection: it only has one at a time.
+            // The gateway has one connection at a time, so it has left this one.
             self.drop_conn(before);
             let now = self.now;
             self.with_server(link, |server| server.closed(now));
@@ -168,7 +168,7 @@ impl Cell {
         }
     }
 
-    /// The far end's close has reached the gateway, which closes its end.
+    /// The far end has closed its direction, which the gateway has noticed: it closes its end.
     pub(super) fn gateway_hears_end(&mut self, id: u64) {
         let delay = self.conns.get(&id).map(|conn| conn.link).map(|link| self.gate(link).network.delay);
         let Some(conn) = self.conns.get_mut(&id) else { return };
@@ -176,12 +176,12 @@ impl Cell {
             self.drop_conn(id);
             return;
         }
-        // The far end is still open, and data in flight arrives there before the reset.
+        // The far end is not closed yet: data on its way arrives there before the reset.
         conn.abandoned = true;
         self.queue.push(self.now + delay.unwrap_or_default(), Due::ResetUp { conn: id });
     }
 
-    /// The gateway reads bytes of a device's connection: replies have arrived.
+    /// The gateway reads bytes from a device's connection: the replies in them have arrived.
     pub(super) fn report_acts(&mut self, id: u64) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
@@ -209,7 +209,7 @@ impl Cell {
         }
     }
 
-    /// A fault of a link begins or ends: it may have made a connection attempt fail.
+    /// A fault of a link begins or ends. It may have made a connection attempt fail.
     pub(super) fn device_link_fault(&mut self, link: LinkId) {
         if let Some(device) = self.servers.get_mut(&link) {
             device.missed_since = None;
@@ -217,14 +217,14 @@ impl Cell {
         self.device_link_changed(link);
     }
 
-    /// Tells the judge about a change of a device's link.
+    /// The state of a link changes: tells the judge if the link leads to a device.
     pub(super) fn device_link_changed(&mut self, link: LinkId) {
         if let Some(judge) = self.judge.as_mut().filter(|_| self.servers.contains_key(&link)) {
             judge.note_fault(self.now);
         }
     }
 
-    /// Whether a connection to a device has a fault.
+    /// Whether a connection to a device is affected by a fault.
     pub(super) fn is_device_faulty(&self) -> bool {
         self.servers.keys().filter_map(|link| self.gates.get(link)).any(|gate| !self.is_sound(gate))
     }
@@ -255,5 +255,5 @@ fn admits(gate: &Gate) -> bool {
     gate.connect_policy == ConnectPolicy::Open && !Way::BOTH.into_iter().any(|way| gate.is_cut(way))
 }
 
-/// Maximum time for a reply to reach the gateway without a fault.
+/// Without faults, a reply arrives at the gateway within this time.
 const ON_ITS_WAY: Duration = Duration::from_millis(15);

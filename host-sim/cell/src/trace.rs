@@ -1,4 +1,4 @@
-//! What happened in the cell, as a hash and, if requested, in full.
+//! A record of what happened in the cell: a hash and, if requested, all entries.
 
 use proto_core::time::Instant;
 
@@ -10,9 +10,9 @@ pub enum What {
     LinkOpen,
     /// The gateway closes a link.
     LinkClose,
-    /// The gateway was told that a link is up.
+    /// A link was reported to the gateway as up.
     LinkUp,
-    /// The gateway was told that a link is down.
+    /// A link was reported to the gateway as down.
     LinkDown,
     /// The gateway sent on a link.
     LinkSent,
@@ -20,7 +20,7 @@ pub enum What {
     LinkReceived,
     /// The controller accepted a connection.
     ControllerOpened,
-    /// The controller was told that a connection is gone.
+    /// A lost connection was reported to the controller.
     ControllerClosed,
     /// Bytes reached the controller.
     ControllerReceived,
@@ -34,7 +34,7 @@ pub enum What {
     ControllerPortReceived,
     /// A fault began or ended.
     Fault,
-    /// A fault in words; not part of the digest.
+    /// A fault as text; not part of the digest.
     Remark,
 }
 
@@ -47,7 +47,7 @@ pub struct Entry {
     pub what: What,
     /// The link, port or connection.
     pub subject: u64,
-    /// The bytes; a CAN frame's id (4 bytes, big-endian) and data; a remark's words.
+    /// The bytes; for a CAN frame its id (4 bytes, big-endian) and data; for a remark its text.
     pub bytes: Vec<u8>,
 }
 
@@ -72,13 +72,13 @@ impl Trace {
         Self { digest: SEED, count: 0, limit: 0, entries: Vec::new() }
     }
 
-    /// Keeps the next `limit` entries in full.
+    /// Keeps the next `limit` entries.
     pub fn keep(&mut self, limit: usize) {
         self.entries.clear();
         self.limit = limit;
     }
 
-    /// A hash of all entries: equal for two runs in which the same happened at the same times.
+    /// A hash of all entries. It is equal for two runs in which the same things happened at the same times.
     pub fn digest(&self) -> u64 {
         self.digest
     }
@@ -88,7 +88,7 @@ impl Trace {
         self.count
     }
 
-    /// The entries kept; see [`Self::keep`].
+    /// The entries kept since [`Self::keep`].
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
@@ -107,7 +107,7 @@ impl Trace {
         }
     }
 
-    /// A note, which is not part of the hash.
+    /// Adds a remark, which is not part of the digest.
     pub(super) fn remark(&mut self, at: Instant, words: std::fmt::Arguments<'_>) {
         if self.entries.len() < self.limit {
             let bytes = words.to_string().into_bytes();
@@ -115,7 +115,7 @@ impl Trace {
         }
     }
 
-    /// Adds whole words in little-endian order: the digest is the same on every machine.
+    /// Takes whole words, read in little-endian order, so the digest is the same on every machine.
     fn mix(&mut self, word: u64) {
         self.digest = (self.digest.rotate_left(23) ^ word).wrapping_mul(ODD);
     }

@@ -64,7 +64,7 @@ impl Cell {
         BusId(self.buses.len() - 1)
     }
 
-    /// The gateway's link that listens on the port number of this address.
+    /// The gateway's link that listens on the port number of the address `to`.
     fn listener(&self, to: &str, tcp: bool) -> Option<LinkId> {
         let wanted = to.rsplit(':').next()?;
         let nth = self.gateway.ports.iter().position(|port| match &port.bus {

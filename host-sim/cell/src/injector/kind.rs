@@ -1,17 +1,17 @@
-//! Kinds of faults: names and relative frequency.
+//! Kinds of faults, with names and relative frequencies.
 
-/// Kinds of faults.
+/// A kind of fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum FaultKind {
-    /// A server refuses connections, and the present one is reset.
+    /// A server refuses connections, and the current connection is reset.
     Refused,
-    /// The network to a server swallows everything, and the present connection is half open.
+    /// The network to a server drops everything, and the current connection becomes half-open.
     BlackHole,
     /// A connection is reset.
     Reset,
     /// A connection is reset in the middle of a transmission.
     ResetMidPacket,
-    /// A connection is half open.
+    /// A connection becomes half-open.
     HalfOpen,
     /// One direction of a connection stalls.
     Stall,
@@ -21,15 +21,15 @@ pub enum FaultKind {
     Burst,
     /// A peer's TCP acknowledges nothing, or receives nothing.
     Unacknowledged,
-    /// The cable of one link, or of all links, is out.
+    /// The cable of one link, or of all links, is unplugged.
     Cable,
     /// Another program sends datagrams to a port where the gateway listens.
     Stranger,
     /// A server executes requests but does not answer.
     Mute,
-    /// A server's answers are late.
+    /// The replies of a server are late.
     SlowAnswers,
-    /// Modbus answers with an exception.
+    /// The Modbus server replies with an exception.
     Exception,
     /// Port 2000 accepts only one client.
     OneClient,
@@ -45,7 +45,7 @@ pub enum FaultKind {
     Garbage,
     /// A line or bus is cut.
     Cut,
-    /// A line's adapter is pulled out.
+    /// The adapter of a line is unplugged.
     Unplugged,
     /// A CAN controller is bus-off.
     BusOff,
@@ -97,7 +97,7 @@ impl FaultKind {
         Self::GatewaySleep,
     ];
 
-    /// Relative frequency. Faults that stop everything for long are rare, or there would be little time for others.
+    /// Relative frequency. Faults that stop everything for long are rare, to leave time for the others.
     pub(super) const fn weight(self) -> u64 {
         match self {
             Self::GatewaySleep | Self::PowerCut | Self::GatewayRestart | Self::Dialect => 1,

@@ -1,7 +1,7 @@
 //! Random faults from a seed: the faults of a soak run.
 //!
-//! A [`FaultInjector`] injects faults at random times and ends each of them after a while. The caller
-//! can inspect the cell at any time; [`FaultInjector::end_all`] ends all faults.
+//! A [`FaultInjector`] injects faults at random times and ends each of them after a while. The caller can inspect the
+//! cell at any time; [`FaultInjector::end_all`] ends all faults.
 
 mod kind;
 
@@ -52,13 +52,14 @@ pub struct FaultInjector {
     next: Instant,
     repairs: Vec<(Instant, FaultKind, Repair)>,
     counts: BTreeMap<FaultKind, u64>,
-    /// The networks without faults.
+    /// The network settings without faults.
     networks: BTreeMap<LinkId, Network>,
 }
 
 impl FaultInjector {
-    /// Injects faults of these kinds from now on, one per `pause` on average. Most faults last up to
-    /// `pause`, outages up to 20 times as long.
+    /// Injects faults of these kinds from now on, one per `pause` on average. Most faults last up to `pause`, outages
+    /// up to
+    /// 20 times as long.
     pub fn new(cell: &mut Cell, kinds: &[FaultKind], pause: Duration) -> Self {
         let mut injector = Self {
             rng: cell.fork_rng(),
@@ -78,7 +79,7 @@ impl FaultInjector {
         &self.counts
     }
 
-    /// Advances time in the cell, with faults.
+    /// Advances time in the cell and injects faults.
     pub fn run(&mut self, cell: &mut Cell, span: Duration) {
         let end = cell.now() + span;
         loop {
@@ -93,7 +94,7 @@ impl FaultInjector {
         }
     }
 
-    /// Ends all present faults.
+    /// Ends all current faults.
     pub fn end_all(&mut self, cell: &mut Cell) {
         for (_, kind, repair) in std::mem::take(&mut self.repairs) {
             cell.remark(format_args!("ends: {}", kind.name()));
@@ -110,7 +111,7 @@ impl FaultInjector {
             apply(cell, repair, &self.networks);
         }
         if now >= self.next {
-            // Some pauses are long enough that everything must work again.
+            // Some pauses are long enough for everything to recover.
             let pause = if self.rng.below(LONG_PAUSE_IN) == 0 { 12 } else { 2 };
             self.next = now + Duration::from_micros(1) + self.rng.up_to(self.pause.saturating_mul(pause));
             if let Some(kind) = self.pick_kind()
@@ -131,7 +132,7 @@ impl FaultInjector {
         })
     }
 
-    /// Injects a fault; `None` if the cell has nothing that it applies to.
+    /// Injects a fault; `None` if it applies to nothing in the cell.
     fn begin(&mut self, cell: &mut Cell, kind: FaultKind) -> Option<()> {
         let rng = &mut self.rng;
         let server = [Link::Command, Link::State, Link::Modbus][rng.below(3) as usize];
@@ -173,7 +174,7 @@ impl FaultInjector {
             }
             FaultKind::Dialect => {
                 let before = cell.controller().dialect();
-                // One at a time, or the repairs would restore the wrong dialect.
+                // One at a time, because with several the repairs would restore the wrong dialect.
                 if self.repairs.iter().any(|(.., repair)| matches!(repair, Repair::Dialect(_))) {
                     return None;
                 }
@@ -209,7 +210,7 @@ impl FaultInjector {
     }
 }
 
-/// Injects a fault of a link; returns how it is repaired, if it is. `lasts` is an unusual duration.
+/// A fault of a link: how it is repaired, if at all. `lasts` is its duration, if it is not the usual one.
 fn link_fault(
     rng: &mut Rng,
     cell: &mut Cell,
@@ -277,7 +278,7 @@ fn link_fault(
         FaultKind::Stranger => {
             let links: Vec<(LinkId, Option<usize>)> = cell.listening_for_datagrams();
             let (link, frame) = pick(rng, links.into_iter())?;
-            // Never a frame's length: the gateway would answer its sender.
+            // Never the length of a frame, as the gateway would then answer the sender.
             let len = Some(rng.below(64) as usize).filter(|len| Some(*len) != frame).unwrap_or(100);
             let bytes = rng.bytes(len);
             cell.stranger_sends(link, &bytes);
@@ -342,7 +343,7 @@ fn server_fault(
     })
 }
 
-/// A fault on the field side.
+/// A fault of a line, a bus or a device.
 fn field_fault(rng: &mut Rng, cell: &mut Cell, kind: FaultKind) -> Option<Option<Repair>> {
     Some(match kind {
         FaultKind::Noise => {
@@ -417,17 +418,17 @@ fn apply(cell: &mut Cell, repair: Repair, networks: &BTreeMap<LinkId, Network>) 
         Repair::BusOn(bus) => cell.bus_on(bus),
         Repair::Power => cell.power_up(),
         Repair::Dialect(name) => cell.replace_controller(name),
-        // The cell wakes the gateway by itself; another stall may have begun since.
+        // The cell wakes the gateway by itself, and another stall may have begun since.
         Repair::Wake => {}
     }
 }
 
-/// The links that share the cable; all links for `None`.
+/// The links that use the cable; all links if `None`.
 fn cables(cell: &Cell, link: Option<LinkId>) -> Vec<LinkId> {
     link.map_or_else(|| cell.link_ids().collect(), |link| vec![link])
 }
 
-/// Cuts the link's direction up, down, or both.
+/// Cuts the link in direction up, down, or both.
 fn cut_ways(cell: &mut Cell, link: LinkId, which: u64) -> Option<Repair> {
     let ways = [which != 1, which != 0];
     for way in [Way::Up, Way::Down].into_iter().filter(|way| ways[*way as usize]) {
@@ -436,7 +437,7 @@ fn cut_ways(cell: &mut Cell, link: LinkId, which: u64) -> Option<Repair> {
     Some(Repair::Ways(link, ways))
 }
 
-/// The gateway waits 10 s for replies to commands, so faults of that server may last longer.
+/// The gateway waits 10 s for replies to commands, so faults of the command server may last longer.
 fn fault_length(rng: &mut Rng, server: Link) -> Option<Duration> {
     (server == Link::Command).then(|| mostly_short(rng, Duration::from_millis(400), 4))
 }

@@ -1,4 +1,4 @@
-//! Acknowledgements and retransmissions of TCP.
+//! TCP acknowledgements and retransmissions.
 
 use proto_core::engine::{Input, LinkId};
 
@@ -8,8 +8,9 @@ use crate::network::Way;
 use crate::tcp::{Retransmission, TCP_TIMEOUT, USER_TIMEOUT};
 
 impl Cell {
-    /// The gateway's transport gives up a connection on which nothing was acknowledged for too long. The controller
-    /// does not learn of this.
+    /// The gateway's transport gives up a connection on which nothing was acknowledged for too long. The controller is
+    /// not
+    /// told.
     pub(crate) fn user_timeout(&mut self, id: u64) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };
@@ -59,7 +60,7 @@ impl Cell {
         }
     }
 
-    /// The driver reports what was acknowledged since its last report.
+    /// The gateway's driver reports what was acknowledged since its last report.
     pub(crate) fn report_acked(&mut self, link: LinkId) {
         if self.is_asleep() {
             return;
@@ -106,7 +107,7 @@ impl Cell {
         self.acknowledged(id, upto);
     }
 
-    /// The controller's TCP acknowledges received data, unless data that it sent since did so.
+    /// The controller's TCP acknowledges received data, unless data sent in the meantime carried the acknowledgement.
     pub(crate) fn ack_leaves(&mut self, id: u64) {
         let Some(conn) = self.conns.get_mut(&id) else { return };
         if std::mem::take(&mut conn.owes_ack) {
@@ -122,7 +123,7 @@ impl Cell {
         let Some(conn) = self.conns.get_mut(&id) else { return };
         let Some(gate) = self.gates.get(&conn.link) else { return };
         if !std::mem::replace(&mut conn.owes_ack, true) {
-            // A reply that the controller sends at once carries the acknowledgement.
+            // If the controller replies at once, the reply carries the acknowledgement.
             self.queue.push(now + gate.network.ack_delay, Due::AckLeaves { conn: id });
         }
     }

@@ -23,7 +23,7 @@ impl Cell {
         }
     }
 
-    /// Sends a connection request; repeats it after `pause`, then twice as long, while there is no answer.
+    /// Sends a connection request. While there is no answer, repeats it after `pause`, and doubles the pause each time.
     pub(crate) fn connect(&mut self, link: LinkId, generation: u64, pause: Duration) {
         let now = self.now;
         let gate = self.gate(link);
@@ -95,7 +95,7 @@ impl Cell {
         let Some(conn) = self.conns.get(&id) else { return };
         let (link, peer) = (conn.link, conn.peer);
         if self.gate(link).is_cut(Way::Up) {
-            // The controller learns of this when it sends something, or by TCP's timeout.
+            // The controller notices it when it sends something, or by TCP's timeout.
             self.queue.push(self.now + TCP_TIMEOUT, Due::TimedOut { conn: id });
             return;
         }
@@ -118,13 +118,13 @@ impl Cell {
         }
     }
 
-    /// The controller closes its end, after the data that it has sent.
+    /// The controller closes its end, after the data that it has already sent.
     pub(crate) fn controller_closes(&mut self, id: u64) {
         self.send_item(id, Way::Down, Item::Closed);
         let Some(conn) = self.conns.get_mut(&id) else { return };
         conn.up.dead = true;
         conn.closing = true;
-        // If the gateway has closed its end too, the connection no longer exists.
+        // If the gateway has closed its end too, the connection is gone.
         if self.gates.get(&conn.link).is_none_or(|gate| gate.conn != Some(id)) {
             self.drop_conn(id);
         }
@@ -199,5 +199,5 @@ impl Cell {
     }
 }
 
-/// How long the first connection request waits for an answer before it is repeated.
+/// How long the first connection request waits for a reply before it is repeated.
 const FIRST_CONNECT_WAIT: Duration = Duration::from_secs(1);

@@ -126,13 +126,13 @@ impl Cell {
         self.controller_input_later(port);
     }
 
-    /// Network ports send without delay.
+    /// Network ports of the controller send without delay.
     fn controller_input_later(&mut self, port: usize) {
         self.controller.handle(self.now, ControllerInput::PortSent { port });
         self.controller_is_seen = false;
     }
 
-    /// Something may have arrived at one end of a connection.
+    /// Handles what has arrived at one end of a connection.
     pub(crate) fn arrive(&mut self, id: u64, way: Way) {
         let now = self.now;
         let is_asleep = self.is_asleep();
@@ -146,7 +146,7 @@ impl Cell {
             return;
         }
         if way == Way::Down && is_asleep && !conn.abandoned {
-            // The data waits in the gateway's socket.
+            // The item waits in the gateway's socket.
             return;
         }
         let (arrived, acks) = conn.pipe(way).next_arrived(now);
@@ -187,7 +187,7 @@ impl Cell {
                 self.controller_bytes(id, link, peer, &bytes);
             }
             (Arrived::Item(Item::Opened), Way::Up) => self.controller_opened(id, peer),
-            // The gateway resets its end, and never closes it.
+            // Cannot happen: the gateway always resets its end instead of closing it.
             (Arrived::Item(Item::Closed), Way::Up) => {}
             (Arrived::Item(Item::Bytes(bytes)), Way::Down) => {
                 self.report_acts(id);
@@ -236,5 +236,5 @@ impl Cell {
     }
 }
 
-/// Maximum number of bytes that the controller buffers for one connection. If there are more, it resets the connection.
+/// Bytes that the controller buffers for one connection. With more it resets the connection.
 const CONTROLLER_BUFFER: u64 = 256 * 1024;
