@@ -9,7 +9,7 @@ use crate::Rng;
 use crate::device::Order;
 
 pub(super) fn rules() -> Rules {
-    // The target is two registers, and the robot's one is below 65536.
+    // The target has two registers. The robot's value is one word, below 65536, so the high register is 0.
     let moves = vec![Source::Constant(0), word("WordOutputReg[1]"), word("WordOutputReg[2]")];
     let trigger = Duration::from_millis(400);
     let mut rules =

@@ -1,4 +1,4 @@
-//! The conveyor of `judged-modbus-tcp.toml`, which is told what the axis is, and the rack of inputs behind the same
+//! The conveyor of `judged-modbus-tcp.toml`, with the same orders as the axis, and the rack of inputs behind the same
 //! address.
 
 use proto_core::time::{Duration, Instant};

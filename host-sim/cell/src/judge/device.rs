@@ -1,4 +1,4 @@
-//! What all devices have in common: their log, their mood, their values, and replies on their way.
+//! The common part of all judged devices: their log, mood, values, and replies on their way.
 
 use proto_core::time::{Duration, Instant};
 
@@ -15,29 +15,29 @@ pub(super) struct Machine {
     timeout: Duration,
     values: [u16; 3],
     counts: [u8; 3],
-    /// Replies that are to leave: when, their bytes, and the entry in the log.
+    /// Replies that will be sent: when, their bytes, and the entry in the log.
     leaving: Vec<(Instant, Vec<u8>, Act)>,
     log: Vec<Act>,
-    /// On a bus, what is damaged is lost.
+    /// The device is on a bus, where a damaged frame is lost.
     is_on_bus: bool,
-    /// What it was asked last.
+    /// The order in the last request; `None` if it was a query.
     order: Option<Order>,
 }
 
-/// What becomes of a reply.
+/// What happens to a reply.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Fate {
-    /// How long it takes.
+    /// How long the reply takes.
     pub delay: Duration,
-    /// It does not leave.
+    /// The reply is not sent.
     pub is_lost: bool,
-    /// It leaves, and is wrong.
+    /// The reply is sent with an error.
     pub is_wrong: bool,
-    /// It is at the gateway in time for sure.
+    /// The reply certainly arrives at the gateway in time.
     pub in_time: bool,
 }
 
-/// What becomes of an order.
+/// The result of an order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Answer {
     Good,
@@ -63,18 +63,18 @@ impl Machine {
         self.moods.now != Mood::Off
     }
 
-    /// It refuses orders: a drive that does sends nothing by itself.
+    /// Whether the device refuses orders. A refusing drive sends nothing on its own.
     pub(super) fn is_refusing(&self) -> bool {
         self.moods.now == Mood::Refusing
     }
 
-    /// A question or an order of its own was received.
+    /// The device received a query or an order.
     pub(super) fn heard(&mut self, order: Option<Order>) {
         self.order = order;
         self.log.push(Act::Heard(order));
     }
 
-    /// It is given an order, and carries it out or does not. `codes` are those that mean something of their own.
+    /// The device gets an order, and executes it or not. `has_codes`: its refusals have codes with different meanings.
     pub(super) fn order(&mut self, order: Order, values: Vec<u32>, has_codes: bool) -> Answer {
         self.heard(Some(order));
         if self.moods.now != Mood::Refusing || self.rng.below(2) == 0 {
@@ -86,9 +86,9 @@ impl Machine {
             false => 1,
         };
         let does = match code {
-            // Accepted: it takes its time.
+            // Acknowledge: accepted, but still in progress.
             5 if has_codes => true,
-            // It failed on the way, or somebody between did.
+            // The device failed while it executed the order, or a gateway in between failed.
             4 | 8 | 10 | 11 => self.rng.below(2) == 0,
             _ => false,
         };
@@ -99,13 +99,13 @@ impl Machine {
         Answer::Refused(code)
     }
 
-    /// One of its values, which says in its high byte which one it is.
+    /// Reads a value of the device. The high byte of a value says which one it is.
     pub(super) fn value(&mut self, nth: usize) -> u16 {
         self.heard(None);
         self.renew(nth)
     }
 
-    /// The same without a question.
+    /// As [`Self::value`], without a query.
     pub(super) fn renew(&mut self, nth: usize) -> u16 {
         if self.rng.below(2) == 0 || self.values[nth] == 0 {
             self.counts[nth] = self.counts[nth].wrapping_add(1);
@@ -115,7 +115,7 @@ impl Machine {
         self.values[nth]
     }
 
-    /// What becomes of the next reply, as its mood is.
+    /// What happens to the next reply in the current mood.
     pub(super) fn fate(&mut self) -> Fate {
         let delay = self.moods.delay(self.timeout, &mut self.rng);
         let happens = self.rng.below(2) == 0;
@@ -127,18 +127,18 @@ impl Machine {
         }
     }
 
-    /// The entry in the log of a reply to what it was asked last. `tells`: it is not the same as the request.
+    /// The log entry of a reply to the last request. `tells`: the reply differs from the request.
     pub(super) fn replied(&self, tells: bool, is_whole: bool, in_time: bool) -> Act {
         Act::Replied { order: self.order, tells, is_whole, in_time: is_whole && in_time }
     }
 
-    /// It does not leave, or not so that it is one.
+    /// Logs that a reply was not sent, or not as a valid reply.
     pub(super) fn lose_reply(&mut self, tells: bool) {
         let lost = self.replied(tells, false, false);
         self.log.push(lost);
     }
 
-    /// A reply of its own leaves, as its mood is. `tells`: it is not the same as the request.
+    /// Sends a reply, depending on the mood. `tells`: the reply differs from the request.
     pub(super) fn reply(&mut self, mut bytes: Vec<u8>, tells: bool, now: Instant) {
         let fate = self.fate();
         if fate.is_lost || fate.is_wrong && self.is_on_bus {
@@ -146,7 +146,7 @@ impl Machine {
         }
         if fate.is_wrong {
             let at = self.rng.below(bytes.len() as u64) as usize;
-            // Never the case of a letter alone, which is no other digit.
+            // Never changes only the case of a letter, which would still be the same digit.
             bytes[at] ^= 1 << self.rng.below(5);
         }
         let left = self.replied(tells, !fate.is_wrong, fate.in_time);
@@ -157,7 +157,7 @@ impl Machine {
         self.leaving.iter().map(|(at, ..)| *at).min().unwrap_or(Instant::NEVER).min(self.moods.ends)
     }
 
-    /// What leaves now; and whether the device has lost its power.
+    /// What is sent now, and whether the device has lost its power.
     pub(super) fn poll(&mut self, now: Instant) -> (Vec<Vec<u8>>, bool) {
         let mut has_lost_power = false;
         if now >= self.moods.ends {
@@ -190,5 +190,5 @@ impl Machine {
     }
 }
 
-/// More than a reply is on its way: on the line, and in an adapter that gathers bytes.
+/// More than a reply takes on the line and in an adapter that gathers bytes.
 const WAY: Duration = Duration::from_millis(25);

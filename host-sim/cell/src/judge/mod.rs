@@ -1,9 +1,9 @@
-//! What devices executed, judged by two logs: the device's own, and the robot's (docs/cell.md section 5).
+//! Judges what devices executed by two logs: the device's own, and the robot's (docs/cell.md section 5).
 //!
-//! In: what each device did and when, as it decoded the requests by itself; the controller's registers whenever they
-//! change, and which of them it has served to whom. Out: violations. Knows neither the engine nor what the
-//! configuration became: what a cell promises is written down in [`Rules`] by hand. Of the gateway it knows when it
-//! starts and when it is not called, and of the line when it had a fault, because neither is the device's doing.
+//! In: what each device did and when, from its own decoding of the requests; the controller's registers whenever they
+//! change, and which of them it has sent to whom. Out: violations. Does not know the engine, or what became of the
+//! configuration: the promises of a cell are written by hand in [`Rules`]. Of the gateway it knows when it starts and
+//! when it is not called, and of the line when it had a fault, because the device causes none of these.
 
 mod axis;
 mod conveyor;
@@ -39,29 +39,29 @@ use rules::{MOVE_BIT, STOP_BIT, Source};
 pub(crate) struct Judge {
     rules: Rules,
     robot: Robot,
-    /// What its values were, each since when.
+    /// The device's values, each with the time since which it holds.
     held: Vec<VecDeque<(Instant, u16)>>,
-    /// What the robot's registers had of them when they were looked at.
+    /// The device's values in the robot's registers, as last seen.
     shown: Vec<Option<u16>>,
-    /// The events that were executed, by the instant of the rise.
+    /// The executed events, in the order of the rises that caused them.
     moved: VecDeque<Moved>,
-    /// A stop that is to be executed.
+    /// A stop that has to be executed.
     stop: Option<Pending>,
     stop_heard: Option<Instant>,
-    /// How often it may be started.
+    /// How often the device may still get its start order.
     starts: u32,
     began: Instant,
-    /// When a reply that is no echo last left in time on a line without fault.
+    /// When the device last sent a reply in time that differs from the request, on a line without faults.
     replied: Option<Instant>,
-    /// What it was told to keep, and when it was refused last with which code.
+    /// The value that the device was told to keep. `refused`: when it last refused one, and with which code.
     kept: Option<u32>,
     refused: Option<(Instant, u8)>,
     is_on: bool,
     /// When something last went wrong with the line or the device.
     quiet_since: Instant,
-    /// When that, or a reply to what it is to keep was missing, late or damaged; or no reply came in time.
+    /// When that last happened, or a reply to the value to keep was missing, late or damaged, or no reply came in time.
     trouble: Instant,
-    /// When a reply last left in time.
+    /// When a reply was last sent in time.
     in_time: Instant,
     is_faulty: bool,
     outcomes: BTreeMap<&'static str, u64>,
@@ -74,22 +74,22 @@ pub(crate) struct Judge {
 #[derive(Debug, Clone, Copy)]
 struct Moved {
     at: Instant,
-    /// From when its values are.
+    /// Since when the values of the event are valid.
     from: Instant,
-    /// When a good reply to it left.
+    /// When a valid reply to it was sent.
     replied: Option<Instant>,
-    /// The step behind it was executed.
+    /// The step after it was executed.
     stepped: bool,
 }
 
-/// A stop that the gateway knows of.
+/// A stop that the controller has sent to the gateway.
 #[derive(Debug, Clone, Copy)]
 struct Pending {
-    /// When the controller answered with it, and when the gateway had the answer.
+    /// When the controller sent the reply with the stop. `known`: when the gateway had received that reply.
     at: Instant,
     known: Option<Instant>,
     conn: u64,
-    /// Other requests that the device heard since.
+    /// Number of other requests that the device has received since.
     others: u32,
 }
 
@@ -136,7 +136,7 @@ impl Judge {
         &self.outcomes
     }
 
-    /// The gateway starts.
+    /// The gateway has started.
     pub(crate) fn gateway_starts(&mut self, now: Instant) {
         self.counted.clear();
         self.robot.gateway_starts(now);
@@ -144,21 +144,21 @@ impl Judge {
         self.port_begins(now);
     }
 
-    /// The gateway is called again after a sleep.
+    /// The gateway is called again after a stall that counts as sleep.
     pub(crate) fn gateway_wakes(&mut self, now: Instant) {
         self.robot.gateway_wakes(now);
         self.not_called(now);
-        // One that it does not have it reads again.
+        // If the gateway does not have the stop yet, it will read it again.
         self.stop = self.stop.filter(|stop| stop.known.is_some());
     }
 
-    /// The gateway's port is there, or there again.
+    /// The gateway's port is up, for the first time or again.
     pub(crate) fn port_begins(&mut self, now: Instant) {
         (self.starts, self.began, self.replied) = (1, now, None);
         self.note_fault(now);
     }
 
-    /// The line, or the gateway's port, has a fault at this instant.
+    /// The line, or the port of the gateway, has a fault at this instant.
     pub(crate) fn note_fault(&mut self, now: Instant) {
         (self.quiet_since, self.trouble) = (now, now);
     }
@@ -168,7 +168,7 @@ impl Judge {
         self.robot.not_called = now;
     }
 
-    /// The controller's variables as they are now.
+    /// Reports the current variables of the controller.
     pub(crate) fn sees_controller(&mut self, image: &[u8], now: Instant) {
         if self.violation.is_some() {
             return;
@@ -194,12 +194,12 @@ impl Judge {
     /// The controller sends bytes on a connection.
     pub(crate) fn answered(&mut self, conn: u64, bytes: &[u8], now: Instant) {
         for at in self.robot.answered(conn, bytes, now, self.stop_heard) {
-            // Until the device has it, each stop is the newest one.
+            // Until the device has received the stop, each new one replaces it.
             self.stop = Some(Pending { at, known: None, conn, others: 0 });
         }
     }
 
-    /// The device did something.
+    /// Reports an act of the device.
     pub(crate) fn did(&mut self, act: Act, now: Instant) {
         if self.violation.is_some() {
             return;
@@ -221,7 +221,8 @@ impl Judge {
             Act::Did(Order::Stop, _) => {}
             Act::Did(Order::Start, _) => {
                 if self.starts == 0 && self.is_away(now) {
-                    // It is the first thing that it hears, and so long nothing was heard of it.
+                    // This is the first request that the device receives, and until now nothing was heard of the
+                    // device.
                     (self.starts, self.replied) = (1, Some(now));
                 }
                 let result = match self.starts.checked_sub(1) {
@@ -278,7 +279,7 @@ impl Judge {
         }
     }
 
-    /// A value of the device reaches the robot.
+    /// A value of the device reaches the robot: checks that the device had it recently enough.
     fn was_held(&self, nth: usize, value: u16, now: Instant) -> Result<(), String> {
         let since = now - self.rules.value_age;
         let mut ends: Vec<Instant> = self.held[nth].iter().skip(1).map(|(at, _)| *at).collect();
@@ -294,7 +295,7 @@ impl Judge {
         ))
     }
 
-    /// The device executes an event: the bit must have risen, just now, for no other.
+    /// The device executes an event: the bit must have risen recently, and for no other execution.
     fn moves(&mut self, values: &[u32], now: Instant) -> Result<(), String> {
         let rules = &self.rules;
         let found = self.robot.rise_for(rules, values, self.stop_heard, now)?;
@@ -322,7 +323,8 @@ impl Judge {
         Ok(())
     }
 
-    /// The second step of a dialogue: behind the first, whose reply left, with the values of then.
+    /// The device executes the second step: it must follow the first, with a reply between, with values that the robot
+    /// had during the first.
     fn steps(&mut self, values: &[u32], now: Instant) -> Result<(), String> {
         let Some((sources, trigger)) = self.rules.step.as_ref() else { return Ok(()) };
         let Some(first) = self.moved.back_mut() else { return Err("a second step without a first".into()) };
@@ -357,7 +359,7 @@ impl Judge {
         }
     }
 
-    /// Whether nothing was heard of it for so long that it has started, to the gateway.
+    /// Whether the device was not heard for so long that, for the gateway, it has started again.
     fn is_away(&self, now: Instant) -> bool {
         let unheard = now.saturating_since(self.replied.unwrap_or(self.began));
         unheard + SLACK >= self.rules.absent
@@ -370,7 +372,7 @@ impl Judge {
         if self.is_away(now) {
             self.starts = 1;
         }
-        // On a faulty line it may be lost.
+        // On a faulty line the reply may be lost.
         if tells && !self.is_faulty {
             self.replied = Some(now);
         }
@@ -406,7 +408,7 @@ impl Judge {
         self.robot.forget(now);
     }
 
-    /// Whether the gateway has a connection, where it could have had one for so long.
+    /// Checks that the gateway has a connection, if it could have had one for long enough.
     fn connects(&mut self, missed: Duration, now: Instant) {
         if missed > CONNECTS_WITHIN {
             let what = format!("the gateway has had no connection to it for {missed}, and could");
@@ -414,14 +416,14 @@ impl Judge {
         }
     }
 
-    /// Whether the device has what the robot has had for long, if nothing speaks against it.
+    /// Whether the device keeps the value that the robot has had for long. `None` if something excuses a difference.
     fn keeps(&self, now: Instant) -> Option<Result<(), String>> {
         let var = self.rules.keeps?;
         let kept = self.kept.filter(|_| self.is_on)?;
         let (changed, value) = self.robot.rests(var)?;
         let mut since = changed.max(self.trouble);
         if let Some((at, code)) = self.refused {
-            // A final refusal ends it until the value changes.
+            // After a final refusal, the value is not sent again until it changes.
             if at >= changed && !matches!(code, 4 | 6 | 8 | 10 | 11) {
                 return None;
             }
@@ -438,7 +440,7 @@ impl Judge {
         })
     }
 
-    /// Takes the gateway's counters of outcomes.
+    /// Adds the gateway's counters of outcomes.
     pub(crate) fn count(&mut self, counters: impl IntoIterator<Item = (&'static str, u32)>) {
         for (name, count) in counters {
             let before = self.counted.insert(name, count).unwrap_or(0);
@@ -448,8 +450,9 @@ impl Judge {
 }
 
 impl Cell {
-    /// Judges from now on what the device of a cell executes, by its own log and the robot's. Time stops after the
-    /// first violation. Call it before time advances.
+    /// From now on, judges what the device of a cell executes by its own log and the robot's. Time stops after the
+    /// first
+    /// violation. Call it before time advances.
     pub(crate) fn judge_device(&mut self, rules: Rules) {
         self.judge = Some(Box::new(Judge::new(rules, self.now)));
         self.queue.push(self.now, crate::due::Due::Survey);
@@ -460,7 +463,7 @@ impl Cell {
         self.judge.as_ref().map(|judge| judge.outcomes().clone()).unwrap_or_default()
     }
 
-    /// The judge looks at the line, and takes the gateway's counters.
+    /// Lets the judge check the line, and reads the gateway's counters.
     pub(crate) fn survey_device(&mut self) {
         let is_asleep = self.is_asleep();
         let is_faulty = is_asleep || self.is_line_faulty();
@@ -482,7 +485,7 @@ impl Cell {
             || self.is_device_faulty()
     }
 
-    /// Before the gateway restarts, and at intervals.
+    /// Reads the gateway's counters of outcomes: before the gateway restarts, and at intervals.
     pub(crate) fn count_outcomes(&mut self) {
         let Some(judge) = &mut self.judge else { return };
         let mut sums: BTreeMap<&'static str, u32> = BTreeMap::new();
@@ -509,26 +512,26 @@ impl Cell {
     }
 }
 
-/// The kinds of devices whose cells are judged.
+/// The kinds of judged devices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// On Modbus RTU.
+    /// A gripper on Modbus RTU.
     Gripper,
-    /// On Modbus RTU, with a motion in two steps.
+    /// An axis on Modbus RTU, with a motion in two steps.
     Axis,
-    /// With texts.
+    /// An RFID head with text frames.
     Rfid,
-    /// On CANopen.
+    /// A drive on CANopen.
     Drive,
-    /// On Modbus TCP, with a motion in two steps and two units.
+    /// A conveyor on Modbus TCP, with a motion in two steps and two units.
     Conveyor,
 }
 
 impl Kind {
-    /// All of them.
+    /// All kinds.
     pub(crate) const ALL: [Self; 5] = [Self::Gripper, Self::Axis, Self::Rfid, Self::Drive, Self::Conveyor];
 
-    /// That of an embedded cell of this name.
+    /// The kind in the embedded cell of this name.
     pub(crate) fn of(cell: &str) -> Option<Self> {
         Some(match cell {
             "judged-gripper" => Self::Gripper,
@@ -540,7 +543,7 @@ impl Kind {
         })
     }
 
-    /// Connects the device, and lets it be judged. Returns the robot's program.
+    /// Connects the device and starts judging it. Returns the robot's program.
     pub(crate) fn begin(self, cell: &mut Cell, config: &GatewayConfig, mut rng: Rng) -> Program {
         let rules = match self {
             Self::Gripper => gripper::rules(),
@@ -591,27 +594,27 @@ pub const OUTCOMES: [&str; 11] = [
     "not-followed",
 ];
 
-/// The bits of the variable that asks.
+/// The bits that request a motion and a stop, with their variable.
 pub(crate) fn bits() -> (SysVar, u8, u8) {
     (rules::var("BitOutputReg[3]"), MOVE_BIT, STOP_BIT)
 }
 
-/// What was held longer ago is not needed.
+/// Older values of the device are not needed.
 const REMEMBERED: Duration = Duration::from_secs(10);
 const MOVES: usize = 16;
-/// A request is at its device so long after it was sent, at most.
+/// A request arrives at its device at most this long after it was sent.
 const ON_THE_LINE: Duration = Duration::from_millis(100);
-/// A longer stall of the gateway is sleep, after which nothing goes on.
+/// A longer stall of the gateway counts as sleep, after which nothing is continued.
 const STALL: Duration = Duration::from_millis(500);
-/// A stop is heard of within this time, if nothing is wrong with line and device.
+/// Without faults of the line and the device, a stop arrives within this time.
 const STOPS_WITHIN: Duration = Duration::from_millis(800);
-/// More requests than this are not lost by chance beside others that arrive.
+/// If more other requests than this have arrived, the stop was not merely lost by chance.
 const OTHERS: u32 = 12;
-/// The device has a value within this time: the longest wait behind refusals, and the late time.
+/// The device has a new value within this time: the longest wait after refusals, plus the late time.
 const KEEPS_WITHIN: Duration = Duration::from_secs(7);
-/// The gateway is connected again within this time: its longest wait, an attempt that failed, and a repetition by TCP.
+/// The gateway reconnects within this time: its longest wait, a failed attempt, and a retransmission by TCP.
 const CONNECTS_WITHIN: Duration = Duration::from_secs(8);
-/// A device that replies at least this often is never away.
+/// A device that replies at least this often never counts as away.
 const AWAY: Duration = Duration::from_millis(500);
-/// How exactly absences are seen from both ends.
+/// How much the two ends may differ about the length of an absence.
 const SLACK: Duration = Duration::from_millis(100);

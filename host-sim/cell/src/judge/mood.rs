@@ -1,4 +1,4 @@
-//! How a device behaves: every few seconds otherwise.
+//! The behaviour of a judged device, which changes every few seconds.
 
 use proto_core::time::{Duration, Instant};
 
@@ -8,11 +8,11 @@ use crate::Rng;
 pub(super) enum Mood {
     Prompt,
     Slow,
-    /// Replies take from 0.2 to 3 times the timeout.
+    /// Replies take 0.2 to 3 times the timeout.
     Late,
-    /// Some replies do not come.
+    /// Some replies are not sent.
     Losing,
-    /// Some replies arrive damaged.
+    /// Some replies are sent with damage.
     Damaged,
     /// Some orders are refused, with one of several codes.
     Refusing,
@@ -20,7 +20,7 @@ pub(super) enum Mood {
     Off,
 }
 
-/// The present mood and its end.
+/// The current mood and its end.
 #[derive(Debug)]
 pub(super) struct Moods {
     pub now: Mood,
@@ -47,7 +47,7 @@ impl Moods {
             (mood, now + Duration::from_micros(1) + rng.up_to(Duration::from_millis(most)));
     }
 
-    /// How long it takes for a reply.
+    /// The delay of a reply.
     pub(super) fn delay(&self, timeout: Duration, rng: &mut Rng) -> Duration {
         let timeout = timeout.as_micros();
         Duration::from_micros(match self.now {

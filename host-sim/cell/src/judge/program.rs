@@ -1,4 +1,4 @@
-//! The robot's program: bits that ask, and values that change.
+//! The robot's program: sets bits that request events, and changes values.
 
 use proto_core::sysvar::SysVar;
 use proto_core::time::{Duration, Instant};
@@ -46,27 +46,27 @@ impl Program {
         if now >= self.next_kept
             && let Some(var) = self.keeps
         {
-            // Often enough, and now and then so seldom that everything comes to rest.
+            // Usually short pauses; sometimes pauses long enough for everything to come to rest.
             let most = [2_000, 40_000][self.rng.below(2) as usize];
             self.next_kept = now + self.rng.up_to(Duration::from_millis(most));
             let value = self.rng.between(1, 60_000);
             set(cell, var, value as u16);
         }
         match self.rng.below(16) {
-            // A pulse with new values, which also change while it lasts.
+            // A pulse with new values, which may also change during the pulse.
             0..7 => {
                 for nth in 0..self.words.len() {
                     self.change(cell, nth);
                 }
                 self.pulse(cell, 0, 400);
             }
-            // A short one, so that another may come before the first is done.
+            // A short pulse, so another may come before the first event is done.
             7 | 8 => {
                 self.pulse(cell, 0, 60);
                 self.next = now + Duration::from_millis(70) + self.rng.up_to(Duration::from_millis(60));
             }
             9 => self.pulse(cell, 1, 500),
-            // Both at once.
+            // Both bits at the same time.
             10 if self.rng.below(3) == 0 => {
                 self.pulse(cell, 0, 300);
                 self.pulse(cell, 1, 300);
@@ -98,7 +98,7 @@ impl Program {
 }
 
 fn set(cell: &mut Cell, var: SysVar, value: u16) {
-    // Any word can have any value.
+    // Cannot fail: a word can have any value.
     let _ = cell.controller_mut().force(InitialTarget::Var(var), f64::from(value));
 }
 

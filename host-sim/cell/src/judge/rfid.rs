@@ -1,5 +1,6 @@
-//! The RFID head of `judged-rfid.toml`: `$`, a letter, four hexadecimal digits, a CRC in four more, a carriage return.
-//! It answers with `!` in place of `$`, or refuses with `?` and two digits.
+//! The RFID head of `judged-rfid.toml`. A request is `$`, a letter, four hexadecimal digits, a CRC of four more digits,
+//! and
+//! a carriage return. The reply has `!` in place of `$`; a refusal has `?` and two digits.
 
 use proto_core::time::{Duration, Instant};
 
@@ -39,7 +40,7 @@ impl Head {
         };
         let answer = match order {
             Some(order) => match self.machine.order(order, vec![u32::from(number)], false) {
-                // A halt cannot be refused.
+                // A stop cannot be refused.
                 Answer::Refused(_) if order == Order::Stop => return,
                 Answer::Good => text(b'!', letter, &format!("{number:04X}")),
                 Answer::Refused(code) => text(b'?', letter, &format!("{code:02X}")),
@@ -87,7 +88,7 @@ impl Device<Vec<u8>> for Head {
     }
 }
 
-/// A frame: the CRC in digits, its low byte first, and a carriage return.
+/// Makes a frame: ends it with the CRC in digits, its low byte first, and a carriage return.
 fn text(first: u8, letter: u8, digits: &str) -> Vec<u8> {
     let mut bytes = vec![first, letter];
     bytes.extend_from_slice(digits.as_bytes());
@@ -98,7 +99,7 @@ fn text(first: u8, letter: u8, digits: &str) -> Vec<u8> {
     bytes
 }
 
-/// The letter and the number of a request.
+/// Parses the letter and the number of a request.
 fn read(frame: &[u8]) -> Option<(u8, u16)> {
     let &[b'$', letter, a, b, c, d, _, _, _, _, b'\r'] = frame else { return None };
     let digits = String::from_utf8(vec![a, b, c, d]).ok()?;

@@ -1,4 +1,4 @@
-//! The robot's log: its registers, and what its Modbus server has served on which connection.
+//! The robot's log: its registers, and what its Modbus server has sent on which connection.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -7,12 +7,12 @@ use proto_core::time::{Duration, Instant};
 
 use super::rules::{MOVE_BIT, Rules, STOP_BIT, Source, var};
 
-/// What the robot had and said.
+/// The log of the robot's registers and replies.
 #[derive(Debug)]
 pub(super) struct Robot {
     bits: SysVar,
     first_coil: u16,
-    /// When the bit that asks for a motion rose, and whether that was executed.
+    /// When the bit that requests a motion rose, and whether that rise was executed.
     rises: VecDeque<(Instant, bool)>,
     was_on: bool,
     words: Vec<Word>,
@@ -20,23 +20,23 @@ pub(super) struct Robot {
     conns: BTreeMap<u64, Conn>,
     /// When the gateway started.
     started: Instant,
-    /// When it was called again after a sleep, which it may begin by discarding what has come.
+    /// When the gateway was last called again after a sleep, at which it may discard what has arrived.
     woke: Instant,
-    /// When it was not called last.
+    /// When the gateway was last not called.
     pub not_called: Instant,
 }
 
-/// A variable that the device is told.
+/// A variable that is sent to the device.
 #[derive(Debug)]
 struct Word {
     var: SysVar,
     register: u16,
     had: VecDeque<(Instant, u16)>,
-    /// When it was read and the gateway has got it.
+    /// When the variable was read in a reply that the gateway has received.
     read: VecDeque<Instant>,
 }
 
-/// The bits as they were read over a connection.
+/// The bits as the gateway read them over a connection.
 #[derive(Debug, Clone, Copy)]
 struct Reading {
     conn: u64,
@@ -44,29 +44,29 @@ struct Reading {
     answered: Instant,
     moves: bool,
     stops: bool,
-    /// When the gateway had it for sure.
+    /// When the gateway had certainly received the reply.
     taken: Option<Instant>,
 }
 
-/// A connection of the Modbus server.
+/// A connection to the Modbus server.
 #[derive(Debug, Default)]
 struct Conn {
     came: Vec<u8>,
     went: Vec<u8>,
-    /// By transaction: when it was asked, function, address and count.
+    /// The pending requests by transaction: when each was received, function, address and count.
     pending: BTreeMap<u16, (Instant, u8, u16, u16)>,
-    /// When the newest request came.
+    /// When the newest request arrived.
     newest: Option<Instant>,
-    /// Registers of the newest answer, which the gateway may not have yet.
+    /// Registers in the newest reply, which the gateway may not have received yet.
     open: Vec<usize>,
 }
 
-/// The rise that an order was executed for.
+/// The rise for which an order was executed.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rise {
-    /// When the controller answered with it.
+    /// When the controller sent the reply with the rise.
     pub read: Instant,
-    /// When it had answered with a stop before, or with it.
+    /// When the controller had sent a reply with a stop, at the latest this one.
     pub stop: Option<Instant>,
 }
 
@@ -101,23 +101,24 @@ impl Robot {
         }
     }
 
-    /// How long what was sent since then may have waited in the transport: a gateway that is not called takes
-    /// nothing back.
+    /// How long data sent since then may have waited in the transport: while the gateway is not called, it cannot take
+    /// data
+    /// back.
     pub(super) fn transport(&self, rules: &Rules, since: Instant) -> Duration {
         if self.not_called >= since { rules.transport } else { Duration::ZERO }
     }
 
-    /// The gateway knows nothing of before.
+    /// The gateway has started, and knows nothing of what was before.
     pub(super) fn gateway_starts(&mut self, now: Instant) {
         self.started = now;
     }
 
-    /// What was answered before, and is not known to be taken, may never be.
+    /// The gateway wakes. It may never take replies that were sent before, unless they are known to be taken.
     pub(super) fn gateway_wakes(&mut self, now: Instant) {
         self.woke = now;
     }
 
-    /// The controller's variables as they are now.
+    /// Reports the current variables of the controller.
     pub(super) fn sees(&mut self, image: &[u8], now: Instant) {
         let on = image[self.bits.image_offset()] >> MOVE_BIT & 1 == 1;
         if on && !std::mem::replace(&mut self.was_on, on) {
@@ -132,19 +133,21 @@ impl Robot {
         }
     }
 
-    /// Bytes came on a connection of the Modbus server.
+    /// Bytes arrived on a connection of the Modbus server.
     pub(super) fn asked(&mut self, id: u64, bytes: &[u8], now: Instant) {
         let conn = self.conns.entry(id).or_default();
         conn.came.extend_from_slice(bytes);
         while let Some(frame) = next_frame(&mut conn.came) {
-            // One at a time is asked, and given up after half a second: what comes earlier follows an answer.
+            // The gateway has one request in flight, and gives it up after half a second. An earlier request shows that
+            // it has received
+            // the reply.
             let before = conn.newest.replace(now);
             if let Some(before) = before.filter(|before| now.saturating_since(*before) < SURELY_TAKEN) {
                 for nth in conn.open.drain(..) {
                     self.words[nth].read.push_back(now);
                 }
                 let newest = self.readings.iter_mut().rev().find(|reading| reading.conn == id);
-                // An answer to what was given up is not taken.
+                // The gateway ignores a reply to a request that it has given up.
                 let woke = self.woke;
                 let is_open = |reading: &&mut Reading| reading.asked >= before && reading.answered >= woke;
                 if let Some(reading) = newest.filter(is_open) {
@@ -159,8 +162,9 @@ impl Robot {
         }
     }
 
-    /// The controller sends on a connection. Returns when it answered with a stop that is new.
-    /// The device has heard of one at `heard`.
+    /// The controller sends on a connection. Returns when it sent replies with a new stop. `heard`: when the device
+    /// last
+    /// received a stop.
     pub(super) fn answered(
         &mut self,
         id: u64,
@@ -213,15 +217,16 @@ impl Robot {
         stops
     }
 
-    /// When the gateway had what was answered at this instant for sure.
+    /// When the gateway had certainly received the reply sent at this instant.
     pub(super) fn taken(&self, conn: u64, answered: Instant) -> Option<Instant> {
         let reading =
             self.readings.iter().find(|reading| (reading.conn, reading.answered) == (conn, answered));
         reading?.taken
     }
 
-    /// The rise that an order with these values, executed now, is of. It is used up. Of several that it may be, it is
-    /// the first before which the device had heard of each stop; it did so `heard` last.
+    /// Finds and uses up the rise for which an order with these values is executed now. If several fit, it is the first
+    /// one
+    /// before which the device had received every stop; `heard` is when it last received one.
     pub(super) fn rise_for(
         &mut self,
         rules: &Rules,
@@ -234,14 +239,14 @@ impl Robot {
         let mut why = "it was carried out, and the bit was not read rising".to_owned();
         for nth in 0..self.readings.len() {
             let on = self.readings[nth];
-            // What the gateway sent before it started anew may still be on the line.
+            // What the gateway sent before its restart may still be on the line.
             let is_of_before = on.answered < self.started && now > self.started + super::ON_THE_LINE;
             if !on.moves || is_of_before {
                 continue;
             }
             let before = self.readings.range(..nth).rev().find(|reading| reading.conn == on.conn);
             let Some(off) = before.filter(|before| !before.moves) else { continue };
-            // In the network, and in the socket of a gateway that is not called.
+            // Time in the network, and in the socket of a gateway that is not called.
             let known = on.taken.unwrap_or(on.answered + ON_ITS_WAY);
             let until = known + *trigger + super::ON_THE_LINE + self.transport(rules, on.answered);
             let late = now.saturating_since(until);
@@ -276,29 +281,29 @@ impl Robot {
             }
         }
         let Some((rise, from, found)) = found else { return Err(why) };
-        // All rises between two readings are one to the gateway.
+        // The gateway sees all rises between two readings as one.
         let between = |at: Instant| at >= from && at <= found.read;
         self.rises.iter_mut().skip(rise).filter(|(at, _)| between(*at)).for_each(|(_, used)| *used = true);
         Ok(found)
     }
 
-    /// When a stop was read over the same connection, at the latest with this reading.
+    /// When a stop was read over the same connection, in this reading at the latest.
     fn stop_before(&self, nth: usize) -> Option<Instant> {
         let conn = self.readings[nth].conn;
         let own = self.readings.range(..=nth).enumerate().filter(|(at, reading)| {
-            // The gateway had all of them.
+            // The gateway has received each of these readings.
             reading.conn == conn && (reading.taken.is_some() || *at == nth)
         });
         let own: Vec<&Reading> = own.map(|(_, reading)| reading).collect();
         let rises = (0..own.len()).rev().find(|&at| own[at].stops && (at == 0 || !own[at - 1].stops));
-        // What was read long ago may have been forgotten here.
+        // Old readings may have been removed here.
         let before = rises.filter(|&at| at > 0).map(|at| own[at - 1].answered)?;
-        // The gateway may have had it by an earlier answer.
+        // The gateway may have received the stop in an earlier reply.
         let mut all = self.readings.range(..=nth).filter(|reading| reading.conn == conn && reading.stops);
         all.find(|reading| reading.answered > before).map(|first| first.answered)
     }
 
-    /// Whether the robot had these values together at an instant between these two.
+    /// Whether the robot had all these values at the same time, at some instant between `from` and `until`.
     pub(super) fn had(&self, sources: &[Source], values: &[u32], from: Instant, until: Instant) -> bool {
         if sources.len() != values.len() {
             return false;
@@ -308,7 +313,7 @@ impl Robot {
             let var = match source {
                 Source::Constant(constant) if constant == value => continue,
                 Source::Constant(_) => return false,
-                // The device knows.
+                // The judge checks these with the device's log.
                 Source::Own(_) => continue,
                 Source::Word(var) => var,
             };
@@ -330,12 +335,12 @@ impl Robot {
         !together.is_empty()
     }
 
-    /// Since when the robot has had its value of a variable.
+    /// The robot's value of a variable, and since when it is unchanged.
     pub(super) fn rests(&self, var: SysVar) -> Option<(Instant, u16)> {
         self.words.iter().find(|word| word.var == var)?.had.back().copied()
     }
 
-    /// Whether the gateway has read a variable again and again in this time.
+    /// Whether the gateway has read a variable regularly since this instant.
     pub(super) fn is_read_steadily(&self, var: SysVar, since: Instant, now: Instant) -> bool {
         let Some(word) = self.words.iter().find(|word| word.var == var) else { return false };
         let mut newest = since;
@@ -348,7 +353,7 @@ impl Robot {
         true
     }
 
-    /// Forgets what is too old.
+    /// Removes entries that are too old.
     pub(super) fn forget(&mut self, now: Instant) {
         let is_old = |at: Instant| now.saturating_since(at) > REMEMBERED;
         while self.readings.front().is_some_and(|reading| is_old(reading.answered)) {
@@ -369,23 +374,23 @@ impl Robot {
     }
 }
 
-/// A word in the controller's image.
+/// A word from the controller's image.
 pub(super) fn word(image: &[u8], var: SysVar) -> u16 {
     let at = var.image_offset();
     u16::from_le_bytes([image[at], image[at + 1]])
 }
 
-/// Takes a whole frame of Modbus TCP off the front.
+/// Takes a complete Modbus TCP frame from the front.
 fn next_frame(bytes: &mut Vec<u8>) -> Option<Vec<u8>> {
     let len = 6 + usize::from(u16::from_be_bytes([*bytes.get(4)?, *bytes.get(5)?]));
     (bytes.len() >= len).then(|| bytes.drain(..len).collect())
 }
 
-/// A request that comes so soon after the one before follows an answer: others are given up after 500 ms.
+/// A request within this time of the previous one follows a reply: requests without reply are given up after 500 ms.
 const SURELY_TAKEN: Duration = Duration::from_millis(150);
-/// An answer is at the gateway within this time, or nothing is taken from it: 500 ms, and a stall.
+/// A reply arrives at the gateway within this time, or is ignored: 500 ms, and a stall.
 const ON_ITS_WAY: Duration = Duration::from_secs(1);
-/// What is read at least this often is never stale.
+/// A variable that is read at least this often is never stale.
 const STEADILY: Duration = Duration::from_millis(250);
-/// What happened longer ago is not needed.
+/// Older entries are not needed.
 const REMEMBERED: Duration = Duration::from_secs(20);

@@ -1,4 +1,4 @@
-//! A slave of a Modbus RTU line with orders and questions of its own, written from the specification.
+//! A slave on a Modbus RTU line with orders and queries of its own, written from the specification.
 
 use proto_core::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use crate::device::Order;
 use crate::rtu::{is_right, sealed};
 use crate::{Device, SlaveDone};
 
-/// What a slave can be asked.
+/// An order or a query that a slave supports.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     pub function: u8,
@@ -46,7 +46,7 @@ impl Slave {
     }
 }
 
-/// What a device with these places answers to a request, which is executed.
+/// Executes a request to a device with these places, and returns the reply.
 pub(super) fn answer(machine: &mut Machine, places: &[Place], pdu: &[u8]) -> Vec<u8> {
     execute(machine, places, pdu).unwrap_or_else(|code| vec![pdu[0] | 0x80, code])
 }
@@ -117,5 +117,5 @@ impl Device<Vec<u8>> for Slave {
     }
 }
 
-/// Bytes that are further apart are of two frames.
+/// Bytes that are further apart belong to different frames.
 const SILENCE: Duration = Duration::from_millis(5);

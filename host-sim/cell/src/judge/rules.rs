@@ -1,44 +1,44 @@
-//! What is promised of one cell, in words of its robot and its device.
+//! The promises that are judged in one cell, in terms of its robot and its device.
 
 use proto_core::sysvar::SysVar;
 use proto_core::time::Duration;
 
-/// Where a value of an order comes from.
+/// The source of a value in an order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Source {
     Word(SysVar),
-    /// A value of the device itself, by its number, as it sent it before.
+    /// A value that the device itself sent before, by its number.
     Own(usize),
     Constant(u32),
 }
 
-/// The promises.
+/// The promises of a cell.
 #[derive(Debug, Clone)]
 pub(crate) struct Rules {
     /// The values of the event, and how long after the rise it may be sent.
     pub moves: (Vec<Source>, Duration),
-    /// The same of the step that follows it.
+    /// The values of the step that follows the event, and how long after the event's reply it may be sent.
     pub step: Option<(Vec<Source>, Duration)>,
-    /// What the device keeps.
+    /// The variable whose value the device keeps.
     pub keeps: Option<SysVar>,
-    /// Where its values go, by number.
+    /// The variables that receive the device's values, by number.
     pub values: Vec<SysVar>,
-    /// What these are when it is silent.
+    /// The safe value of these variables, when the device is silent.
     pub safe: u16,
-    /// How old a value may be when it arrives at the robot.
+    /// The maximum age of a value when it arrives at the robot.
     pub value_age: Duration,
-    /// A bit is not an old one for so long.
+    /// A bit does not count as stale for this long.
     pub stale_after: Duration,
-    /// What was away for so long has started.
+    /// A device that was away for this long counts as started.
     pub absent: Duration,
-    /// How long what was sent may wait in the transport of a gateway that is not called.
+    /// How long sent data may wait in the transport of a gateway that is not called.
     pub transport: Duration,
-    /// The most that each variable may be, for the program; beyond it nothing is sent.
+    /// The maximum of each variable in the program; larger values are not sent.
     pub limits: Vec<(SysVar, u16)>,
 }
 
 impl Rules {
-    /// Those of a device that is asked with this timeout.
+    /// The rules of a device with this timeout.
     pub(super) fn new(moves: Vec<Source>, values: &[&str], timeout: Duration) -> Self {
         Self {
             moves: (moves, PORT_TIMEOUT),
@@ -46,8 +46,9 @@ impl Rules {
             keeps: Some(var("WordOutputReg[3]")),
             values: values.iter().map(|name| var(name)).collect(),
             safe: 7,
-            // Until it is overdue, in all repetitions, on its way to the controller, in a stall of the gateway and of
-            // its transport.
+            // The sum of: the time until the port is overdue, all repetitions, the way to the controller, and a stall
+            // of the
+            // gateway and of its transport.
             value_age: PORT_TIMEOUT + timeout.saturating_mul(9) + Duration::from_millis(3_500),
             stale_after: Duration::from_millis(300),
             absent: Duration::from_secs(3),
@@ -72,12 +73,12 @@ impl Rules {
     }
 }
 
-/// A word of the robot.
+/// A word register of the robot.
 pub(super) fn word(name: &str) -> Source {
     Source::Word(var(name))
 }
 
-/// A variable of the table, by name.
+/// A variable of the table by name.
 pub(super) fn var(name: &str) -> SysVar {
     match SysVar::parse(name) {
         Ok(var) => var,
@@ -85,7 +86,7 @@ pub(super) fn var(name: &str) -> SysVar {
     }
 }
 
-/// The coils that ask for a motion and for a stop.
+/// The coils that request a motion and a stop.
 pub(super) const MOVE_BIT: u8 = 0;
 pub(super) const STOP_BIT: u8 = 1;
 const PORT_TIMEOUT: Duration = Duration::from_secs(1);

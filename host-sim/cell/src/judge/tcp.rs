@@ -1,5 +1,6 @@
-//! A Modbus TCP server with orders and questions of its own, written from the specification: the header, one or more
-//! units behind it, and what servers do wrong.
+//! A Modbus TCP server with orders and queries of its own, written from the specification: the header, one or more
+//! units,
+//! and the errors that servers make.
 
 use proto_core::time::{Duration, Instant};
 
@@ -9,11 +10,11 @@ use crate::device::Act;
 use crate::device::{Served, Server};
 use crate::{Rng, SlaveDone};
 
-/// A device behind the address of the server.
+/// A unit behind the address of the server.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unit {
     pub id: u8,
-    /// Its replies are in the log: orders go to this one.
+    /// Replies of this unit are logged: orders go to it.
     pub is_logged: bool,
     pub places: &'static [Place],
 }
@@ -23,11 +24,11 @@ pub(super) struct Unit {
 pub(super) struct Units {
     machine: Machine,
     units: &'static [Unit],
-    /// What came on the connection and is no request yet.
+    /// Received bytes that form no request yet.
     came: Vec<u8>,
     is_open: bool,
     leaving: Vec<(Instant, Served)>,
-    /// The second part of a reply leaves then, and nothing between.
+    /// When the second part of a reply is sent; nothing may be sent between the two parts.
     not_before: Instant,
 }
 
@@ -37,18 +38,18 @@ impl Units {
         Self { machine, units, came, is_open: false, leaving, not_before: Instant::ZERO }
     }
 
-    /// Executes a request, which has the length that its header says.
+    /// Executes a complete request.
     fn handle(&mut self, frame: &[u8], now: Instant) {
         let (id, pdu) = (frame[6], &frame[7..]);
         let Some(unit) = self.units.iter().find(|unit| unit.id == id) else {
-            // A gateway that has no path to it.
+            // Exception 0x0A, as from a gateway that has no path to the unit.
             return self.leave(frame, vec![pdu[0] | 0x80, 0x0A], false, now);
         };
         let reply = answer(&mut self.machine, unit.places, pdu);
         self.leave(frame, reply, unit.is_logged, now);
     }
 
-    /// A reply leaves, as the mood is. `is_logged`: it is in the log.
+    /// Sends a reply, depending on the mood. `is_logged`: the reply is logged.
     fn leave(&mut self, request: &[u8], pdu: Vec<u8>, is_logged: bool, now: Instant) {
         let fate = self.machine.fate();
         let at = (now + fate.delay).max(self.not_before);
@@ -66,7 +67,7 @@ impl Units {
         self.leave_whole(reply, is_logged, fate, at);
     }
 
-    /// A good reply leaves; one in eight in two parts.
+    /// Sends a valid reply; one in eight is sent in two parts.
     fn leave_whole(&mut self, mut reply: Vec<u8>, is_logged: bool, fate: Fate, mut at: Instant) {
         let rng = &mut self.machine.rng;
         let mut in_time = fate.in_time;
@@ -82,7 +83,7 @@ impl Units {
     }
 }
 
-/// What a server sends in place of its reply.
+/// What the server sends instead of a valid reply.
 fn wrong(request: &[u8], pdu: &[u8], rng: &mut Rng) -> Vec<Served> {
     let unit = request[6];
     let own = framed(&request[..4], unit, pdu);
@@ -95,7 +96,7 @@ fn wrong(request: &[u8], pdu: &[u8], rng: &mut Rng) -> Vec<Served> {
     let cut = |len: usize| garbled(own[..len].to_vec());
     let newest = u16::from_be_bytes([request[0], request[1]]);
     match rng.below(14) {
-        // The id of one of the requests before.
+        // The transaction id of an earlier request.
         0 | 1 => {
             let [high, low] = newest.wrapping_sub(rng.between(1, 6) as u16).to_be_bytes();
             vec![garbled(framed(&[high, low, 0, 0], unit, pdu))]
@@ -105,11 +106,11 @@ fn wrong(request: &[u8], pdu: &[u8], rng: &mut Rng) -> Vec<Served> {
         3 => vec![changed(6, if rng.below(2) == 0 { 0xFE } else { 2 })],
         4 => vec![changed(7, 0x03)],
         5 => vec![changed(3, 1)],
-        // A length that is too long, too short, or none.
+        // A length that is too long, too short, or invalid.
         6 => vec![changed(5, 0x08)],
         7 => vec![changed(5, 0x01)],
         8 => vec![changed(4, 0x40)],
-        // Data of another length in a frame of its own.
+        // Data of another length, in a frame with a matching header.
         9 => {
             let mut longer = pdu.to_vec();
             longer.push(0);
@@ -122,7 +123,7 @@ fn wrong(request: &[u8], pdu: &[u8], rng: &mut Rng) -> Vec<Served> {
     }
 }
 
-/// The header before a unit's reply. `begin`: transaction and protocol.
+/// A reply of a unit with its header. `begin`: transaction and protocol id.
 fn framed(begin: &[u8], unit: u8, pdu: &[u8]) -> Vec<u8> {
     let mut frame = begin.to_vec();
     frame.extend((pdu.len() as u16 + 1).to_be_bytes());
@@ -150,7 +151,7 @@ impl Server for Units {
             let &[_, _, p1, p0, l1, l0, ..] = &self.came[..] else { return };
             let len = usize::from(u16::from_be_bytes([l1, l0]));
             if (p1, p0) != (0, 0) || !(3..=254).contains(&len) {
-                // Nothing behind it can be read.
+                // Nothing after it can be parsed.
                 self.leaving.push((now, Served::Reset));
                 self.came.clear();
                 return;
@@ -191,5 +192,5 @@ impl Server for Units {
     }
 }
 
-/// Between the parts of a reply.
+/// The longest gap between the parts of a reply.
 const LONGEST_GAP: Duration = Duration::from_millis(40);

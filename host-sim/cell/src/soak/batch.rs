@@ -22,13 +22,13 @@ pub struct Batch {
     seed: u64,
     span: Duration,
     run_length: Duration,
-    /// Number of runs of all shares.
+    /// Number of runs in all shares.
     runs: usize,
     share: Share,
     next: AtomicUsize,
     stop: AtomicBool,
     done: Mutex<BTreeMap<usize, Report>>,
-    /// Virtual time that has passed, unfinished runs included.
+    /// Virtual time that has passed, including that of unfinished runs.
     elapsed_us: AtomicU64,
     failed: Mutex<Option<Failure>>,
 }
@@ -38,11 +38,11 @@ pub struct Batch {
 pub struct Failure {
     /// Index of the run in the batch.
     pub run: usize,
-    /// Seed of the run.
+    /// Seed of the run itself.
     pub seed: u64,
     /// The cell's name.
     pub cell: String,
-    /// Time from the run's start.
+    /// Time since the run's start.
     pub after: Duration,
     /// The violation.
     pub what: Violation,
@@ -62,32 +62,32 @@ pub struct Progress {
 pub struct Total {
     /// Number of finished runs.
     pub runs: usize,
-    /// Number of all runs.
+    /// Number of all runs of the batch.
     pub of: usize,
     /// Virtual time.
     pub span: Duration,
-    /// Runs of each cell, and their virtual time.
+    /// Number of runs of each cell, and their virtual time.
     pub cells: BTreeMap<String, (usize, Duration)>,
     /// Faults of each kind.
     pub faults: BTreeMap<FaultKind, u64>,
-    /// Frames in and out, by cell and port.
+    /// Number of frames received and sent, by cell and port.
     pub ports: BTreeMap<(String, String), (u64, u64)>,
-    /// Sent and received, by kind of link.
+    /// Number of sends and receives, by kind of link.
     pub links: BTreeMap<String, (u64, u64)>,
-    /// Entries of the traces.
+    /// Number of entries in the traces.
     pub events: u64,
-    /// Values written to the controller that were checked.
+    /// Number of values written to the controller that were checked.
     pub writes: u64,
     /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
-    /// Results of events of judged devices.
+    /// The outcomes of events of judged devices.
     pub outcomes: BTreeMap<String, u64>,
-    /// One hash of the traces of all runs.
+    /// A hash of the traces of all runs.
     pub hash: u64,
 }
 
 impl Batch {
-    /// `span` of virtual time in these cells, in turn.
+    /// A batch of `span` virtual time in all, with these cells in turn.
     pub fn new(scenarios: Vec<Scenario>, level: Level, seed: u64, span: Duration) -> Self {
         let (run_length, runs) = split(span, scenarios.len());
         Self {
@@ -106,7 +106,7 @@ impl Batch {
         }
     }
 
-    /// Only the runs of one share.
+    /// Restricts the batch to the runs of one share.
     #[must_use]
     pub fn only(mut self, share: Share) -> Self {
         self.share = share;
@@ -114,7 +114,7 @@ impl Batch {
         self
     }
 
-    /// Number of runs of all shares.
+    /// Number of runs in all shares.
     pub fn runs(&self) -> usize {
         self.runs
     }
@@ -150,7 +150,7 @@ impl Batch {
         self.between(runs)
     }
 
-    /// The digests of this share's runs, in their order; `None` for a run that is not finished.
+    /// The digests of this share's runs, in order; `None` for an unfinished run.
     pub fn digests(&self) -> impl Iterator<Item = Option<u64>> {
         let done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
         let digests: Vec<_> =
@@ -158,8 +158,9 @@ impl Batch {
         digests.into_iter()
     }
 
-    /// The cells' names, each with a hash of its configuration and of the start of its first run: equal on two machines
-    /// that would run the batch alike.
+    /// The names of the cells, each with a hash of its configuration and of the first moments of its first run. The
+    /// hashes
+    /// are equal on two machines that would run the batch in the same way.
     pub fn fingerprints(&self) -> Vec<(String, u64)> {
         let first_moments = |nth: usize, scenario: &Scenario| {
             let mut soak = Soak::new(scenario, self.seed_of(nth), self.level).ok()?;
@@ -167,7 +168,7 @@ impl Batch {
             Some(soak.report().digest)
         };
         let of = |(nth, scenario): (usize, &Scenario)| {
-            // A panic is reported by the share that contains that run.
+            // A panic is reported when that run is executed as part of a share.
             let sample = catch_unwind(AssertUnwindSafe(|| first_moments(nth, scenario))).ok().flatten();
             let words = [scenario.hash(), sample.unwrap_or(0)];
             (scenario.name.clone(), words.into_iter().fold(0, mix))
@@ -175,21 +176,23 @@ impl Batch {
         self.scenarios.iter().enumerate().map(of).collect()
     }
 
-    /// The seed of a run; its remainder determines the cell.
+    /// The seed of a run. Its remainder selects the cell.
     pub fn seed_of(&self, run: usize) -> u64 {
         let cells = self.scenarios.len().max(1) as u64;
         let mut rng = Rng::new(self.seed ^ (run as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-        // Short enough to type.
+        // Seeds are short enough to type.
         let drawn = rng.below(1 << 40);
         drawn - drawn % cells + run as u64 % cells
     }
 
-    /// The cell for a run's seed.
+    /// The cell that the seed of a run selects.
     pub fn scenario_of(scenarios: &[Scenario], seed: u64) -> Option<&Scenario> {
         scenarios.get((seed % scenarios.len().max(1) as u64) as usize)
     }
 
-    /// Runs until all are done, one fails, or [`Batch::stop`] is called. Several threads may call it at once.
+    /// Executes runs until all are done, one fails, or [`Batch::stop`] is called. Several threads may call this at the
+    /// same
+    /// time.
     pub fn work(&self) {
         while !self.stop.load(Relaxed) {
             let run = self.next.fetch_add(1, Relaxed);
@@ -200,7 +203,7 @@ impl Batch {
         }
     }
 
-    /// Stops the present runs.
+    /// Stops the current runs.
     pub fn stop(&self) {
         self.stop.store(true, Relaxed);
     }
@@ -211,12 +214,12 @@ impl Batch {
         Progress { elapsed: Duration::from_micros(self.elapsed_us.load(Relaxed)), runs }
     }
 
-    /// The failure of the earliest run that failed.
+    /// The failure with the lowest run index.
     pub fn failure(&self) -> Option<Failure> {
         self.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// The sums so far.
+    /// The sums of the runs finished so far.
     pub fn total(&self) -> Total {
         let done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
         let mut total = Total { of: self.share_runs().len(), ..Total::default() };
@@ -233,7 +236,7 @@ impl Batch {
         let length = self.between(run..run + 1);
         let mut soak = match Soak::new(scenario, seed, self.level) {
             Ok(soak) => soak,
-            // The caller has made each cell once before.
+            // Cannot happen: the caller has built each cell before.
             Err(error) => panic!("{}: {error}", scenario.name),
         };
         let mut reached = Duration::ZERO;
@@ -309,7 +312,7 @@ impl Total {
         self.fold(run, report.digest);
     }
 
-    /// The outcomes of events that were too rare, each with its count, in a long harsh run of all cells with judged
+    /// The outcomes of events that were too rare, each with its count, after a long harsh run of all cells with judged
     /// devices. Empty for any other run.
     pub fn rare_outcomes(&self, level: Level) -> Vec<(&'static str, u64)> {
         let spans = |kind| self.cells.iter().filter(move |(name, _)| Kind::of(name) == Some(kind));
@@ -328,9 +331,9 @@ impl Total {
     }
 }
 
-/// The length and the number of runs.
+/// The length of a run, and the number of runs.
 pub(super) fn split(span: Duration, cells: usize) -> (Duration, usize) {
-    // Each cell gets a run, even if the span is short.
+    // Each cell gets a run, even if `span` is short.
     let share = span.as_micros().div_ceil(cells.max(1) as u64).max(1);
     let run_length = RUN_LENGTH.min(Duration::from_micros(share));
     (run_length, span.as_micros().div_ceil(run_length.as_micros()) as usize)
@@ -340,13 +343,13 @@ fn mix(hash: u64, word: u64) -> u64 {
     (hash.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15)
 }
 
-/// In this much time of each judged cell, every outcome of an event occurs often. A little less than the share of one
-/// cell in a day of all cells.
+/// In this much time of each judged cell, every outcome of an event occurs often. It is a little less than the share of
+/// one cell in a day of all cells.
 const LONG: Duration = Duration::from_secs(3_600);
-/// Minimum number of occurrences in [`LONG`].
+/// How often every outcome occurs at least in that time.
 const OFTEN: u64 = 100;
-/// The part of a run that is in a cell's fingerprint.
+/// The first part of a run, which counts for its cell's fingerprint.
 const SAMPLE: Duration = Duration::from_secs(1);
 
-/// How long a run goes on between two checks for a stop.
+/// The time between two checks whether to stop.
 const SLICE: Duration = Duration::from_secs(2);

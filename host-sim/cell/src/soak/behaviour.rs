@@ -1,5 +1,6 @@
-//! The behaviour of a polled device, which changes every few seconds: prompt, slow, late, refusing, dead, or with
-//! damaged replies.
+//! The behaviour of a simulated device that answers requests. It changes every few seconds: prompt, slow, late,
+//! refusing,
+//! dead, or with damaged replies.
 
 use proto_core::time::{Duration, Instant};
 
@@ -9,38 +10,38 @@ use crate::Rng;
 pub(super) enum Behaviour {
     Prompt,
     Slow,
-    /// Some replies arrive after they have been given up.
+    /// Some replies come only after the master has given them up.
     Late,
-    /// It refuses requests, if it can.
+    /// The device refuses requests, if it can.
     Refusing,
-    /// One bit of some replies is wrong.
+    /// Some replies have a wrong bit.
     Damaged,
-    /// Some replies end too early.
+    /// Some replies are cut short.
     Short,
-    /// Some replies are lost.
+    /// Some replies are missing.
     Losing,
-    /// Some replies are those of another slave, or to other requests.
+    /// Some replies come from another slave, or answer another request.
     Mistaken,
-    /// Other bytes come before some replies.
+    /// Some replies have other bytes before them.
     Noisy,
     Dead,
 }
 
-/// The present behaviour of a device.
+/// The current behaviour of a device.
 #[derive(Debug)]
 pub(super) struct Behaves {
     pub like: Behaviour,
     ends: Instant,
 }
 
-/// The effect of a new behaviour on the device.
+/// How a new behaviour changes the state of the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Change {
-    /// It has power.
+    /// The device has power.
     Alive,
-    /// It loses its power.
+    /// The device loses its power.
     Dead,
-    /// It loses its power for so long that it forgets everything it was told.
+    /// The device loses its power for so long that it forgets what it was told.
     Forgets,
 }
 
@@ -49,7 +50,7 @@ impl Behaves {
         Self { like: Behaviour::Prompt, ends: start + Duration::from_secs(5) }
     }
 
-    /// Begins another behaviour when the present one is over.
+    /// Starts another behaviour when the current one is over.
     pub(super) fn update(&mut self, now: Instant, rng: &mut Rng) -> Option<Change> {
         if now < self.ends {
             return None;
@@ -88,9 +89,9 @@ impl Behaves {
     }
 }
 
-/// A reply is at the master this long before three times the timeout, in microseconds: the time of a reply on a line,
-/// of other replies before it, and in an adapter that gathers bytes.
+/// In microseconds. A reply is sent this long before three times the timeout, so it arrives within them: time for the
+/// reply on the line, for replies before it, and for an adapter that gathers bytes.
 const MARGIN: u64 = 45_000;
-/// After this long without power, a device has forgotten everything it was told. By then it has missed enough requests
-/// for the gateway to know that it was away.
+/// After this long without power, a device has forgotten what it was told. By then the gateway has sent enough requests
+/// to know that the device was away.
 const FORGETS_AFTER: Duration = Duration::from_millis(1_500);

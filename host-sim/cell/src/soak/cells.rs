@@ -1,4 +1,4 @@
-//! The default cells of a soak run.
+//! The cells that a soak run uses by default.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -10,7 +10,7 @@ use recipe_config::file::{self, FileError, Text};
 
 use crate::oracle::unmodelled::unmodelled;
 
-/// A gateway and a controller.
+/// A gateway and a controller configuration.
 #[derive(Debug, Clone)]
 pub struct Scenario {
     /// The cell's name.
@@ -44,8 +44,9 @@ macro_rules! embedded {
     };
 }
 
-/// A seed selects by position, so the order must not change. Controllers of examples that have field ports
-/// of their own are replaced, since no device would be connected to them.
+/// A seed selects a cell by position, so the order must not change. If the controller of an example has field ports of
+/// its
+/// own, the controller is replaced, since no device would be connected to them.
 const EMBEDDED: [Embedded; 22] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),
@@ -88,7 +89,7 @@ impl Scenario {
     /// The embedded cell of this name; `None` if there is none.
     ///
     /// # Errors
-    /// Same as [`Scenario::all`].
+    /// The errors of [`Scenario::all`].
     pub fn named(name: &str) -> Result<Option<Self>, FileError> {
         EMBEDDED.iter().find(|cell| cell.name == name).map(Self::parse).transpose()
     }
@@ -110,7 +111,7 @@ impl Scenario {
     /// A hash of both configurations, the same on every machine.
     pub(super) fn hash(&self) -> u64 {
         let mut hash = Fnv(0xCBF2_9CE4_8422_2325);
-        // Writing to it cannot fail.
+        // Cannot fail: the hasher accepts everything.
         let _ = write!(hash, "{:?} {:?}", self.gateway, self.controller);
         hash.0
     }
@@ -123,7 +124,7 @@ impl Scenario {
     }
 }
 
-/// FNV-1a hash of written text.
+/// FNV-1a over the written text.
 struct Fnv(u64);
 
 impl Write for Fnv {

@@ -1,8 +1,11 @@
-//! Soak runs: hours of cells in virtual time with random faults, and every step of the gateway checked
-//! (docs/cell.md sections 4 and 5).
+//! Soak runs: hours of cells in virtual time with random faults, where every step of the gateway is checked
+//! (docs/cell.md
+//! sections 4 and 5).
 //!
 //! In: cells, a seed, a level of faults, virtual time. Out: a [`Total`], the same for the same seed on every machine
-//! and for any number of threads, or the first violation and how to repeat it. Does not print: `host-sim soak` does.
+//! and
+//! for any number of threads, or the first violation and how to repeat it. Does not know how results are printed:
+//! `host-sim soak` does that.
 
 mod batch;
 mod behaviour;
@@ -68,7 +71,7 @@ impl Level {
     }
 }
 
-/// One cell that runs under faults.
+/// A cell that runs with faults.
 #[derive(Debug)]
 pub struct Soak {
     cell: Cell,
@@ -77,12 +80,12 @@ pub struct Soak {
     start: Instant,
 }
 
-/// What happens at the robot during a run.
+/// What happens at the controller.
 #[derive(Debug)]
 enum Life {
     /// Random events.
     World(World),
-    /// A program that polls a device.
+    /// A robot program that sends orders to a device.
     Program(Program),
 }
 
@@ -107,23 +110,23 @@ impl Life {
 pub struct Report {
     /// Virtual time that has passed.
     pub span: Duration,
-    /// The hash of its trace.
+    /// The hash of the trace.
     pub digest: u64,
-    /// Entries of its trace.
+    /// Number of entries in the trace.
     pub events: u64,
     /// Faults of each kind.
     pub faults: BTreeMap<FaultKind, u64>,
-    /// Frames in and out of each of the gateway's field ports, by name.
+    /// Number of frames received and sent on each field port of the gateway, by name.
     pub ports: Vec<(String, u64, u64)>,
-    /// Sends and receives on each link, by name.
+    /// Number of sends and receives on each link, by name.
     pub links: Vec<(&'static str, u64, u64)>,
-    /// Values written to the controller that were checked.
+    /// Number of values written to the controller that were checked.
     pub writes: u64,
     /// Number of checks of each invariant.
     pub checks: BTreeMap<Invariant, u64>,
-    /// Results of events, if a device is judged.
+    /// The outcomes of events, if a device is judged.
     pub outcomes: BTreeMap<&'static str, u64>,
-    /// The first violation, and its time from the start.
+    /// The first violation, and its time since the start.
     pub violation: Option<(Violation, Duration)>,
 }
 
@@ -181,7 +184,7 @@ impl Soak {
         &self.cell
     }
 
-    /// The cell, mutable, such as to keep its trace.
+    /// The cell, mutable, for example to keep its trace.
     pub fn cell_mut(&mut self) -> &mut Cell {
         &mut self.cell
     }
@@ -191,8 +194,9 @@ impl Soak {
         self.cell.now().saturating_since(self.start)
     }
 
-    /// Advances time until this long after the start, or until an invariant is violated. How the time is
-    /// split into calls makes no difference.
+    /// Advances time until `elapsed` after the start, or until an invariant is violated. The result does not depend on
+    /// how the
+    /// time is split into calls.
     pub fn run_to(&mut self, elapsed: Duration) {
         let end = self.start + elapsed;
         while self.cell.violation().is_none() {
@@ -229,7 +233,7 @@ impl Soak {
             ports: ports.collect(),
             links: links.collect(),
             writes: self.cell.watched_writes(),
-            // There is no report after a panic.
+            // A panic leaves no report, so a report means that this check passed.
             checks: self.cell.checks().into_iter().chain([(Invariant::NoPanic, 1)]).collect(),
             outcomes: self.cell.outcomes(),
             violation: self
@@ -240,7 +244,7 @@ impl Soak {
     }
 }
 
-/// How a line delivers bytes; gathered bytes are delivered after at most `longest_ms`.
+/// Varies how a line delivers bytes. Gathered bytes are reported after at most `longest_ms` milliseconds.
 fn vary_delivery(line: &mut Line, longest_ms: u64, level: Level, rng: &mut Rng) {
     line.chunking = match rng.below(5) {
         2 => Chunking::Gathered(Duration::from_millis(rng.between(1, longest_ms))),
@@ -253,12 +257,12 @@ fn vary_delivery(line: &mut Line, longest_ms: u64, level: Level, rng: &mut Rng) 
     }
 }
 
-/// How the line of a judged device delivers bytes.
+/// Sets how the line of a judged device delivers bytes.
 fn prepare_line(cell: &mut Cell, config: &GatewayConfig, level: Level, rng: &mut Rng) {
     let Some(port) = config.ports.first().filter(|port| matches!(port.bus, Bus::Rs485(_))) else { return };
     let line = cell.line_of(&port.name);
     vary_delivery(cell.line(line), 8, level, rng);
-    // An adapter that echoes although the configuration does not say so.
+    // An adapter that echoes sent bytes, without a setting that says so.
     cell.line(line).gives_back = level == Level::Harsh && rng.below(3) == 0;
 }
 

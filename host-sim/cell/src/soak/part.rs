@@ -1,7 +1,7 @@
-//! What one machine ran of a batch, as a document; and one document of all of them.
+//! The result of a batch, or of one machine's share of it, as a document; and merging the documents of all shares.
 //!
-//! In: a batch that has ended, or the documents of its shares. Out: a [`Part`], plain data for serde. Refuses a share
-//! that is missing, occurs twice or belongs to another batch. Reads no files.
+//! In: a finished batch, or the documents of its shares. Out: a [`Part`], plain data for serde. Does not know files.
+//! A share that is missing, duplicated or of another batch is refused.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -13,7 +13,7 @@ use super::batch::{Failure, split};
 use super::{Batch, Share, Total};
 use crate::{FaultKind, Invariant};
 
-/// A share of a batch and its results.
+/// A share of a batch, and its results.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Part {
@@ -31,15 +31,15 @@ pub struct Part {
     pub cells: Vec<PartCell>,
     /// Which share this is, such as `2/3`.
     pub shard: String,
-    /// Wall time in microseconds; of merged documents the longest.
+    /// Wall time in microseconds; in a merged document the longest of all shares.
     pub wall_us: u64,
-    /// The first run of the share.
+    /// Index of the first run of the share.
     pub first_run: usize,
-    /// The digests of the runs in hexadecimal digits; `None` for an unfinished run.
+    /// The digests of the share's runs as hexadecimal digits; `None` for an unfinished run.
     pub digests: Vec<Option<String>>,
-    /// The sums of its finished runs.
+    /// The sums of the share's finished runs.
     pub sums: Sums,
-    /// The failure that ended it.
+    /// The failure that ended the share.
     pub failure: Option<PartFailure>,
 }
 
@@ -49,9 +49,9 @@ pub struct Part {
 pub struct PartCell {
     /// Its name.
     pub name: String,
-    /// How it was chosen, for the command that repeats a run; `None` if all embedded cells run.
+    /// How the cell was chosen, for the command that repeats a run; `None` if all embedded cells run.
     pub chosen: Option<String>,
-    /// A hash of its configuration and of its first moments, which another build may change.
+    /// A hash of the configuration and of the first moments of the cell, which another build may change.
     pub fingerprint: String,
 }
 
@@ -59,21 +59,21 @@ pub struct PartCell {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Sums {
-    /// Entries of the traces.
+    /// Number of entries in the traces.
     pub events: u64,
-    /// Values that were checked.
+    /// Number of values that were checked.
     pub writes: u64,
-    /// Runs of each cell, and their virtual time in microseconds.
+    /// Number of runs of each cell, and their virtual time in microseconds.
     pub cells: BTreeMap<String, (usize, u64)>,
-    /// Frames in and out, by cell and port.
+    /// Number of frames received and sent, by cell and port.
     pub ports: BTreeMap<String, BTreeMap<String, (u64, u64)>>,
-    /// Sent and received, by kind of link.
+    /// Number of sends and receives, by kind of link.
     pub links: BTreeMap<String, (u64, u64)>,
-    /// Faults by name.
+    /// Number of faults by name.
     pub faults: BTreeMap<String, u64>,
-    /// Checks by the invariant's name.
+    /// Number of checks by the invariant's name.
     pub checks: BTreeMap<String, u64>,
-    /// Outcomes of events by name.
+    /// Number of outcomes of events by name.
     pub outcomes: BTreeMap<String, u64>,
 }
 
@@ -81,22 +81,22 @@ pub struct Sums {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PartFailure {
-    /// Its index in the batch.
+    /// Index of the run in the batch.
     pub run: usize,
-    /// Its own seed.
+    /// Seed of the run itself.
     pub seed: u64,
     /// The cell's name.
     pub cell: String,
-    /// Time from the run's start, in microseconds.
+    /// Time since the run's start in microseconds.
     pub after_us: u64,
     /// The violation, with its invariant.
     pub what: String,
 }
 
-/// Why documents do not make one batch.
+/// Why documents cannot be merged into one batch.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NotOneBatch {
-    /// Which of the documents, by index; `None` for all of them.
+    /// Index of the faulty document; `None` if it concerns all of them.
     pub nth: Option<usize>,
     /// The reason.
     pub why: String,
@@ -111,7 +111,7 @@ impl fmt::Display for NotOneBatch {
 impl std::error::Error for NotOneBatch {}
 
 impl Part {
-    /// The results of a batch that has ended. `chosen` says for each cell how it was chosen.
+    /// The document of a finished batch. `chosen` says for each cell how it was chosen.
     pub fn of(batch: &Batch, chosen: &[String], wall_us: u64) -> Self {
         let total = batch.total();
         let runs = batch.share_runs();
@@ -141,7 +141,7 @@ impl Part {
     /// The sums, with one hash of all finished runs.
     ///
     /// # Errors
-    /// The reason if the document contradicts itself.
+    /// The reason, if the document contradicts itself.
     pub fn total(&self) -> Result<Total, String> {
         let (_, of) = split(Duration::from_micros(self.virtual_us), self.cells.len());
         let share: Share = self.shard.parse().map_err(|error| format!("shard: {:?}: {error}", self.shard))?;
@@ -175,10 +175,10 @@ impl Part {
         Ok(total)
     }
 
-    /// One document for all shares, as if one machine had run them.
+    /// Merges the documents of all shares into one, as if one machine had run them.
     ///
     /// # Errors
-    /// [`NotOneBatch`] if a share is missing, is incomplete or occurs twice, or if the shares are not of one batch.
+    /// [`NotOneBatch`] if a share is missing, incomplete or duplicated, or if the shares are of different batches.
     pub fn merge(parts: &[Self]) -> Result<Self, NotOneBatch> {
         let of = |nth: usize, why: String| NotOneBatch { nth: Some(nth), why };
         let all = |why: &str| NotOneBatch { nth: None, why: why.to_owned() };
@@ -218,13 +218,13 @@ impl Part {
             merged.digests.extend(part.digests.iter().cloned());
             merged.sums.add(&part.sums);
             merged.wall_us = merged.wall_us.max(part.wall_us);
-            // In the order of runs, so the first one is the earliest.
+            // Parts are in the order of runs, so the first failure is the earliest one.
             merged.failure = merged.failure.or_else(|| part.failure.clone());
         }
         Ok(merged)
     }
 
-    /// Why the document is not of the same batch as the first one.
+    /// The reason why this document belongs to another batch than `first`.
     fn differs_from(&self, first: &Self) -> Result<(), String> {
         if self.soak != FORMAT || self.version != VERSION {
             return Err(format!(
@@ -361,6 +361,6 @@ fn add_pairs(sums: &mut BTreeMap<String, (u64, u64)>, others: &BTreeMap<String, 
     }
 }
 
-/// The version of the documents.
+/// The version of the document format.
 pub const FORMAT: u32 = 2;
 const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -1,9 +1,11 @@
-//! Simulated devices with frames of their own, which are polled: all peers of a port, in one device.
+//! Simulated devices with frames of their own that answer requests: all peers of a port in one device.
 //!
-//! In: the port's exchanges and a seed. Out: replies, most of them correct and in time, and unsolicited frames. Each
-//! peer changes its behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged,
-//! truncated, lost, preceded by noise, or to another request. No reply takes three times its timeout or longer: no
-//! master could distinguish it from a reply to the next request.
+//! In: the exchanges of a port and a seed. Out: replies, most of them right and in time, and unsolicited frames. Each
+//! peer
+//! changes its behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged, cut
+//! short, lost, behind noise, or to another request. No reply takes three times the timeout: after that, no master
+//! could
+//! tell it from a reply to the next request.
 
 use proto_core::config::{DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Transaction};
 use proto_core::device::{Carrier, Probe};
@@ -22,13 +24,13 @@ pub(super) struct Peers {
     rng: Rng,
     peers: Vec<Peer>,
     asks: Vec<Ask>,
-    /// Unsolicited frames: those of the port's input part without an exchange.
+    /// Unsolicited frames: those of the port's input part that belong to no exchange.
     unasked: Vec<(Option<usize>, Sends)>,
     next_unasked: Instant,
-    /// Bytes that are not a complete request yet.
+    /// Received bytes that form no request yet.
     held: Vec<u8>,
     held_until: Instant,
-    /// Replies to be sent, and when.
+    /// Replies that will be sent, and when.
     leaving: Vec<(Instant, Made)>,
     done: Vec<SlaveDone>,
 }
@@ -57,7 +59,7 @@ enum Request {
     Frame {
         id: Option<CanId>,
         frame: Box<DeviceFrame>,
-        /// Elements that are the same in each request.
+        /// Elements that are the same in every request.
         constants: Vec<(usize, f64)>,
     },
 }
@@ -69,7 +71,7 @@ struct Sends {
     values: Vec<Scalar>,
 }
 
-/// A frame to be sent.
+/// A message that is to be sent.
 #[derive(Debug, Clone)]
 struct Made {
     id: Option<CanId>,
@@ -77,7 +79,7 @@ struct Made {
 }
 
 impl Peers {
-    /// The devices of a port; `None` if its recipe has no exchanges of frames.
+    /// The peers of a port; `None` if its recipe has no exchanges with frames.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, mut rng: Rng) -> Option<Self> {
         let recipe = config.recipes.get(usize::from(port.recipe))?;
         let is_on_can = port.bus.is_can();
@@ -169,14 +171,14 @@ impl Peers {
         let is_on_can = made.id.is_some();
         match behaves.like {
             _ if !happens => {}
-            // Frames on a bus cannot be damaged like this, and without a checksum nobody could detect it.
+            // On a bus frames are not damaged; elsewhere nobody could detect damage without a checksum.
             Behaviour::Damaged | Behaviour::Short | Behaviour::Noisy if is_on_can || !has_checksum => return,
             Behaviour::Damaged => made.bytes[rng.below(len) as usize] ^= 1 << rng.below(8),
             Behaviour::Short => made.bytes.truncate(rng.between(1, len - 1) as usize),
             Behaviour::Losing => return,
             Behaviour::Mistaken => {
                 let other = rng.below(asks.len() as u64) as usize;
-                // If it replied late as another device, no master could distinguish that from the other device's reply.
+                // No master could tell a late reply in another device's name from that device's own reply.
                 if other == nth || asks[other].peer != asks[nth].peer {
                     return;
                 }
@@ -193,7 +195,7 @@ impl Peers {
             _ => {}
         }
         if template.begins(&made.bytes) {
-            // A letter in the other case does not damage a checksum of letters.
+            // A checksum in hexadecimal digits still matches after only the case of a letter has changed.
             done.push(SlaveDone {
                 slave: number,
                 what: Done::Replied { exchange, frame: made.bytes.clone() },
@@ -202,7 +204,7 @@ impl Peers {
         leaving.push((now + delay, made));
     }
 
-    /// The exchange that has these bytes as its request.
+    /// The exchange whose request these bytes are.
     fn request_of(&self, id: Option<CanId>, bytes: &[u8]) -> Option<usize> {
         self.asks.iter().position(|ask| ask.request.is(id, bytes))
     }
@@ -337,7 +339,7 @@ impl Sends {
         Self { template, values }
     }
 
-    /// Changes some values, and returns the frame with them.
+    /// Changes some values, and returns the frame with the new values.
     fn next(&mut self, rng: &mut Rng) -> Made {
         for (value, content) in self.values.iter_mut().zip(&self.template.fields) {
             if rng.below(3) == 0 {
@@ -348,7 +350,7 @@ impl Sends {
     }
 }
 
-/// Maximum pause between unsolicited frames.
+/// The longest pause between unsolicited frames.
 const UNASKED: Duration = Duration::from_millis(500);
-/// Incomplete bytes are discarded after this time.
+/// Bytes that form no request within this time are discarded.
 const SILENCE: Duration = Duration::from_millis(8);

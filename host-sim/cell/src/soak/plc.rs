@@ -1,7 +1,7 @@
 //! A simulated PLC: the master of a Modbus RTU line on which the gateway is a slave.
 //!
-//! In: the blocks of a port's recipe and a seed. Out: requests at random times, most of them for data of the blocks,
-//! some for other data, to other slaves, broadcast, or damaged.
+//! In: the blocks of a port's recipe and a seed. Out: requests at random times. Most address registers of the blocks;
+//! some address other registers or slaves, are broadcasts, or are damaged.
 
 use proto_core::config::{Bus, GatewayConfig, Port, Transaction};
 use proto_core::modbus::rtu::Table;
@@ -14,7 +14,7 @@ use crate::{Device, Rng};
 #[derive(Debug)]
 pub(super) struct Plc {
     rng: Rng,
-    /// The slave's address.
+    /// The address of the gateway as a slave.
     slave: u8,
     blocks: Vec<Block>,
     behaviour: Behaviour,
@@ -29,17 +29,17 @@ struct Block {
     first: u16,
     count: u16,
     is_written: bool,
-    /// The values of the newest write.
+    /// The values that were written last.
     values: Vec<u16>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Behaviour {
     Steady,
-    /// It does not wait for replies.
+    /// The master does not wait for replies.
     Hasty,
     Silent,
-    /// Some requests are invalid in some way.
+    /// Some requests are wrong.
     Careless,
 }
 
@@ -73,7 +73,7 @@ impl Plc {
         self.behaviour_ends = now + self.rng.up_to(Duration::from_millis(most));
     }
 
-    /// A request for a block: address and PDU.
+    /// A request for a block: slave address and PDU.
     fn request(&mut self) -> (u8, Vec<u8>) {
         let rng = &mut self.rng;
         let nth = rng.below(self.blocks.len() as u64) as usize;
@@ -108,7 +108,7 @@ impl Plc {
             return (address, write(is_coils, first, values.collect()));
         }
         if !block.is_written && rng.below(3) == 0 {
-            // A part, or more than the block.
+            // A part of the block, or more than the block.
             first += rng.below(count.into()) as u16;
             count = 1 + rng.below(u64::from(count) + 1) as u16;
         }
@@ -141,7 +141,7 @@ impl Device<Vec<u8>> for Plc {
         let rng = &mut self.rng;
         let pause = match self.behaviour {
             Behaviour::Hasty => rng.between(1_000, silence + 10_000),
-            // The end of the request, and the longest reply.
+            // Time for the end of the request and for the longest reply.
             _ => silence * 2 + rng.between(40_000, 150_000),
         };
         if self.behaviour == Behaviour::Careless {
@@ -149,14 +149,14 @@ impl Device<Vec<u8>> for Plc {
             match rng.below(10) {
                 0 => frame[rng.below(len) as usize] ^= 1 << rng.below(8),
                 1 => frame.truncate(rng.between(1, len) as usize),
-                // Without a silence between two requests, the newest one counts.
+                // Two requests without silence between them: the newest counts.
                 2 => frame = [&frame[..], &frame].concat(),
                 3 => frame = [sealed(&[self.slave % 247 + 1, 6, 0, 1, 0, 2]), frame].concat(),
                 4 => frame = [&[0, 0][..], &frame].concat(),
                 _ => {}
             }
         }
-        // A line may produce such a byte when its direction changes.
+        // A line can produce such a byte while its direction changes.
         let false_byte = |rng: &mut Rng| match rng.below(8) {
             0 => vec![0],
             1 => vec![0xFF],
@@ -172,7 +172,7 @@ fn pdu(function: u8, first: u16, number: u16) -> Vec<u8> {
     [&[function][..], &first.to_be_bytes(), &number.to_be_bytes()].concat()
 }
 
-/// A write of these registers or coils, with the shortest function.
+/// Writes these registers or coils, with the shortest function code.
 fn write(is_coils: bool, first: u16, values: Vec<u16>) -> Vec<u8> {
     match (is_coils, &values[..]) {
         (true, &[coil]) => pdu(5, first, if coil != 0 { 0xFF00 } else { 0 }),

@@ -1,7 +1,7 @@
 //! A simulated field device that sends random frames of a port's recipe, most of them valid.
 //!
-//! In: the gateway's configuration and a seed. Out: frames at random times. A device changes its behaviour
-//! every few seconds: steady, hasty, silent, stuck, careless.
+//! In: the gateway's configuration and a seed. Out: frames at random times. The device changes its behaviour every few
+//! seconds: steady, hasty, silent, stuck, careless.
 
 use proto_core::config::{Bus, GatewayConfig, Port};
 use proto_core::sysvar::Direction;
@@ -22,27 +22,27 @@ enum Behaviour {
     Careless,
 }
 
-/// One device for all frames of a port.
+/// A device that sends all frames of a port.
 #[derive(Debug)]
 pub(super) struct RandomDevice {
     rng: Rng,
     templates: Vec<Template>,
     /// The newest values, by template.
     values: Vec<Vec<Scalar>>,
-    /// The port's timeout, or the part of it for one of several alternating frames with alive counters.
+    /// The port's timeout. If frames with alive counters take turns, one frame's part of it.
     timeout: Duration,
-    /// Time of a frame on the line.
+    /// Transmission time of a frame on the line.
     frame_time: Duration,
     behaviour: Behaviour,
     behaviour_ends: Instant,
-    /// Values of command fields do not change before this, like a button that is held.
+    /// Values of command fields do not change before this, as if a button is held.
     pressed_until: Instant,
     next: Instant,
     nth: usize,
 }
 
 impl RandomDevice {
-    /// A device for the port; `None` if the port has no input part or is a listening one.
+    /// A device for the port; `None` if the port has no input part or is a listening port.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, mut rng: Rng) -> Option<Self> {
         let recipe = config.recipes.get(usize::from(port.recipe))?;
         let mut templates = Vec::new();
@@ -94,8 +94,9 @@ impl RandomDevice {
         };
     }
 
-    /// Advances to the next template, with new values, and sets the next deadline. Returns the template's
-    /// index; `None` if the device is silent.
+    /// Advances to the next template, with new values, and sets the next deadline. Returns the index of the template;
+    /// `None`
+    /// if the device is silent.
     fn step(&mut self, now: Instant) -> Option<usize> {
         if now >= self.behaviour_ends {
             self.change_behaviour(now);
@@ -103,7 +104,7 @@ impl RandomDevice {
         let timeout = self.timeout.as_micros();
         let pause = match self.behaviour {
             Behaviour::Steady => self.rng.between(timeout / 8, timeout * 6 / 10),
-            // About as fast as the line allows, sometimes faster.
+            // About as fast as the line allows, sometimes faster than that.
             Behaviour::Hasty => self.rng.between(0, self.frame_time.as_micros() * 2),
             Behaviour::Silent => {
                 self.next = self.behaviour_ends.max(now + Duration::from_micros(1));
@@ -112,7 +113,7 @@ impl RandomDevice {
             Behaviour::Stuck => timeout / 3,
             Behaviour::Careless => self.rng.between(timeout / 20, timeout * 2),
         };
-        // Frames beyond the line's rate would only queue up.
+        // Frames beyond the line's rate would only be queued.
         let floor = self.frame_time.as_micros().max(100);
         self.next = now + Duration::from_micros(pause.max(floor));
         self.nth = (self.nth + 1) % self.templates.len();
@@ -125,7 +126,7 @@ impl RandomDevice {
                     continue;
                 }
                 let before = std::mem::replace(value, changed(&mut self.rng, content, *value));
-                // A button is pressed briefly, or for seconds.
+                // A button is pressed briefly, or for several seconds.
                 if is_command && before != *value && self.rng.below(2) == 0 {
                     self.pressed_until = now + self.rng.up_to(Duration::from_secs(6));
                 }
@@ -158,7 +159,7 @@ impl Device<Vec<u8>> for RandomDevice {
                     let more = rng.between(1, 20) as usize;
                     frame.extend(rng.bytes(more));
                 }
-                // A head before the frame.
+                // An extra head before the frame.
                 4 => drop(frame.splice(..0, template.head.clone())),
                 _ => {
                     let twice = frame.clone();

@@ -1,4 +1,4 @@
-//! A batch that is shared between machines, and the runs of each machine.
+//! A batch shared between machines: determines which machine executes which runs.
 
 use std::fmt;
 use std::ops::Range;
@@ -12,7 +12,7 @@ pub struct Share {
 }
 
 impl Share {
-    /// Share `nth` of `of`, counted from 1; `None` if there is no such share, or for more than [`MAX_SHARES`].
+    /// Share `nth` of `of`, counted from 1. `None` if there is no such share, or `of` is more than [`MAX_SHARES`].
     pub fn new(nth: usize, of: usize) -> Option<Self> {
         (1 <= nth && nth <= of && of <= MAX_SHARES).then_some(Self { nth, of })
     }
@@ -27,8 +27,9 @@ impl Share {
         self.of
     }
 
-    /// The runs of the share. They are consecutive, so a share with enough runs has all cells in turn. Empty only if
-    /// there are fewer runs than shares.
+    /// The runs of the share. They are contiguous, so each share with enough runs has all cells in turn. Empty only if
+    /// there
+    /// are fewer runs than shares.
     pub fn runs(self, all: usize) -> Range<usize> {
         let border = |nth: usize| (all as u128 * nth as u128 / self.of as u128) as usize;
         border(self.nth - 1)..border(self.nth)

@@ -9,8 +9,8 @@ use proto_core::wire::state;
 use super::Soak;
 use crate::{Entry, What};
 
-/// The kept entries of the cell's trace, one per line: seconds since the run's start, kind, port or link,
-/// bytes; Modbus and commands also in words.
+/// The kept entries of the cell's trace, one per line: seconds since the run's start, kind, port or link, bytes. Modbus
+/// frames and commands are also decoded.
 pub fn show_trace(soak: &Soak) -> String {
     let mut text = String::new();
     for entry in soak.cell().trace().entries() {
@@ -97,7 +97,7 @@ fn shown(soak: &Soak, entry: &Entry) -> String {
     format!("{}{more}{says}", hex.join(" "))
 }
 
-/// A request in words; `None` if it is incomplete.
+/// Decodes a request; `None` if it is incomplete.
 fn request(adu: &[u8]) -> Option<String> {
     let (transaction, pdu) = split(adu)?;
     let says = match Request::parse(pdu).ok()? {
@@ -115,7 +115,7 @@ fn request(adu: &[u8]) -> Option<String> {
     Some(format!("#{transaction}: {says}"))
 }
 
-/// A response in words; `None` if it is incomplete.
+/// Decodes a response; `None` if it is incomplete.
 fn answer(adu: &[u8]) -> Option<String> {
     let (transaction, pdu) = split(adu)?;
     let (&code, rest) = pdu.split_first()?;
@@ -127,7 +127,7 @@ fn answer(adu: &[u8]) -> Option<String> {
     })
 }
 
-/// The transaction id and the PDU.
+/// Splits an ADU into transaction id and PDU.
 fn split(adu: &[u8]) -> Option<(u16, &[u8])> {
     let (head, pdu) = adu.split_first_chunk::<{ adu::HEADER_LEN }>()?;
     let [high, low, ..] = *head;

@@ -1,9 +1,12 @@
 //! Simulated slaves of a Modbus RTU line: all slaves that a port polls, in one device.
 //!
-//! In: the port's exchanges and a seed. Out: replies, most of them correct and in time. Each slave changes its
-//! behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged, lost or under
-//! another slave's address. No reply takes three times its timeout or longer: no master could distinguish it from a
-//! reply to the next request (proto-core/docs/wire/modbus-rtu.md section 4).
+//! In: the exchanges of a port and a seed. Out: replies, most of them right and in time. Each slave changes its
+//! behaviour
+//! every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged, lost or under another
+//! slave's
+//! address. No reply takes three times the timeout: after that, no master could tell it from a reply to the next
+//! request
+//! (proto-core/docs/wire/modbus-rtu.md section 4).
 
 use std::collections::BTreeMap;
 
@@ -22,7 +25,7 @@ use crate::{Device, Done, Rng, SlaveDone};
 pub(super) struct Slaves {
     rng: Rng,
     slaves: Vec<OneSlave>,
-    /// Replies to be sent, and when.
+    /// Replies that will be sent, and when.
     leaving: Vec<(Instant, Vec<u8>)>,
     done: Vec<SlaveDone>,
 }
@@ -34,11 +37,11 @@ struct OneSlave {
     slave: Slave,
     bank: Bank,
     behaves: Behaves,
-    /// The shortest timeout of its exchanges.
+    /// The shortest timeout of the slave's exchanges.
     timeout: Duration,
 }
 
-/// The registers and coils that are requested; others are refused.
+/// The registers and coils that the port reads or writes; requests for others are refused.
 #[derive(Debug, Default)]
 struct Bank {
     coils: BTreeMap<u16, u16>,
@@ -55,7 +58,7 @@ struct Bank {
 }
 
 impl Slaves {
-    /// The slaves of a port; `None` if it is not a master of a Modbus line.
+    /// The slaves of a port; `None` if the port is not a Modbus master.
     pub(super) fn new(config: &GatewayConfig, port: &Port, start: Instant, rng: Rng) -> Option<Self> {
         let recipe = config.recipes.get(usize::from(port.recipe))?;
         let Bus::Rs485(line) = &port.bus else { return None };
@@ -90,7 +93,7 @@ impl Slaves {
         (!slaves.is_empty()).then_some(Self { rng, slaves, leaving: Vec::new(), done: Vec::new() })
     }
 
-    /// Lets a slave execute a request.
+    /// Lets a slave execute a request and reply.
     fn answer(&mut self, nth: usize, now: Instant) {
         let rng = &mut self.rng;
         let others: Vec<u8> = self.slaves.iter().map(|slave| slave.address).collect();
@@ -181,7 +184,7 @@ impl Device<Vec<u8>> for Slaves {
 }
 
 impl OneSlave {
-    /// Applies a change of behaviour.
+    /// Applies a new behaviour to the slave's state.
     fn change(&mut self, change: Change) {
         if change == Change::Alive {
             return;
@@ -218,7 +221,7 @@ impl Bank {
         }
     }
 
-    /// Changes some measured values, and bits that another master has written.
+    /// Changes some of the values that the slave measures, and some bits that another master writes.
     fn change(&mut self, rng: &mut Rng) {
         for (address, bits) in self.others.iter().filter(|(_, bits)| **bits != 0) {
             let value = self.holding.entry(*address).or_default();
@@ -233,7 +236,7 @@ impl Bank {
                 *value = match (is_coil, rng.below(40)) {
                     (true, 0..8) => 1 - *value,
                     (true, _) => *value,
-                    // Mostly small, so that most numbers of two registers fit their variables.
+                    // Mostly small, so most numbers of two registers fit their variables.
                     (false, 0) => rng.below(65_536) as u16,
                     (false, 1..15) => 0,
                     (false, _) => rng.below(20_000) as u16,
@@ -323,7 +326,7 @@ impl RegisterBank for Bank {
     }
 
     fn read_discrete(&self, address: u16, count: u16, packed: &mut [u8]) -> Result<(), Exception> {
-        // Without a count, the request only checks that the function exists.
+        // Without a count, the caller only checks whether the function is supported.
         if count == 0 { Ok(()) } else { self.bits(&self.discrete, address, count, packed) }
     }
 

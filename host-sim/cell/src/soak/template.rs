@@ -17,31 +17,31 @@ pub(super) struct Template {
     pub tail: Vec<u8>,
     pub id: Option<CanId>,
     pub fields: Vec<Content>,
-    /// A device's own frame, whose elements are the fields without the checksum.
+    /// The frame of a device, if it has one; its elements are the fields without the checksum.
     device: Option<Box<DeviceFrame>>,
 }
 
-/// The kind of values of a field.
+/// The kind of a field, which determines its random values.
 #[derive(Debug, Clone)]
 pub(super) enum Content {
-    /// Bits, which mostly change one at a time.
+    /// Bits; mostly one changes at a time.
     Bits,
-    /// Numbers of this type, mostly up to `most`, which most bound variables accept.
+    /// Numbers of this type, mostly up to `most`. Most bound variables accept these.
     Number { ty: ScalarType, most: f64 },
     /// A constant, or padding.
     Constant,
-    /// Not an element of the frame: the layout computes it.
+    /// The layout computes the checksum; it is no element of the frame.
     Checksum,
-    /// A number that increases with each frame, mostly by one, and goes from `max` to 0.
+    /// A number that increases with each frame, mostly by one, and wraps from `max` to 0.
     Counter { max: u32 },
-    /// Numbers that sometimes pick commands.
+    /// Numbers that sometimes select commands.
     Commands { ty: ScalarType, values: Vec<i64> },
-    /// A text made from a random number; the frame's layout says how it ends.
+    /// A text made from a random number. The layout of the frame says how it ends.
     Text { width: TextWidth, ignored: Vec<Vec<u8>>, capacity: usize },
 }
 
 impl Template {
-    /// A frame; with an id, it is a CAN frame.
+    /// A template. Only frames on a bus have an id.
     pub(super) fn new(
         config: &GatewayConfig,
         id: Option<CanId>,
@@ -52,7 +52,7 @@ impl Template {
         Self::carried(config, (carrier, id), delimiters, fields)
     }
 
-    /// A frame of a part that defines how its frames are separated.
+    /// A template of a stream part, with the head and tail of that part.
     pub(super) fn of_part(config: &GatewayConfig, part: &StreamPart) -> Self {
         let is_cut = part.framing != Boundary::Fields || part.escape.is_some();
         let carrier = if is_cut { Carrier::Whole } else { Carrier::Stream };
@@ -67,7 +67,7 @@ impl Template {
     ) -> Self {
         let (head, tail) = (delimiters.0.to_vec(), delimiters.1.to_vec());
         let is_device = fields.iter().any(FieldSpec::is_device);
-        // Validation has refused what cannot be laid out.
+        // Cannot fail: validation refuses fields that have no layout.
         let device = is_device.then(|| DeviceFrame::new(carrier, Direction::Input, delimiters, fields).ok());
         let fields = fields.iter().map(|field| content(config, field)).collect();
         Self { head, tail, id, fields, device: device.flatten().map(Box::new) }
@@ -78,7 +78,7 @@ impl Template {
         self.fields.iter().map(zero).collect()
     }
 
-    /// The bytes between head and tail; in a device's own frame, with its checksum.
+    /// The bytes between head and tail; in a device's own frame, including its checksum.
     pub(super) fn payload(&self, values: &[Scalar]) -> Vec<u8> {
         if let Some(device) = &self.device {
             let elements = self.fields.iter().zip(values);
@@ -115,13 +115,13 @@ impl Template {
         self.fields.iter().any(|content| matches!(content, Content::Checksum))
     }
 
-    /// Whether bytes begin with a frame like this one.
+    /// Whether `bytes` begins with a frame of this template.
     pub(super) fn begins(&self, bytes: &[u8]) -> bool {
         let probe = |device: &DeviceFrame| device.layout.probe(&device.elements, bytes);
         self.device.as_ref().is_some_and(|device| matches!(probe(device), Probe::Frame(_)))
     }
 
-    /// The whole frame.
+    /// The complete frame.
     pub(super) fn whole(&self, values: &[Scalar]) -> Vec<u8> {
         [&self.head[..], &self.payload(values), &self.tail].concat()
     }
@@ -167,7 +167,7 @@ fn content(config: &GatewayConfig, field: &FieldSpec) -> Content {
 }
 
 impl Content {
-    /// A text for this number: mostly of full length, some longer, some empty.
+    /// The text for this number: mostly as long as there is room for, sometimes longer or empty.
     fn text(&self, number: u32) -> Vec<u8> {
         let Self::Text { width, ignored, capacity } = self else { return Vec::new() };
         let (kind, number) = (number % 16, number / 16);
@@ -185,7 +185,7 @@ impl Content {
     }
 }
 
-/// The first and the last value of a command.
+/// The first and the last value that selects a command.
 fn ends(entry: &CommandEntry) -> impl Iterator<Item = i64> + use<> {
     let (first, last) = (entry.first, entry.last);
     [first, last].into_iter().take(if first == last { 1 } else { 2 })

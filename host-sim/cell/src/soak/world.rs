@@ -1,4 +1,4 @@
-//! Random events at the controller while a cell runs: inputs change, programs set registers, someone presses a button.
+//! Random events at the controller while a cell runs: inputs change, programs set registers, a person presses a button.
 
 use proto_core::config::{FieldSpec, GatewayConfig};
 use proto_core::engine::Plan;
@@ -10,7 +10,7 @@ use proto_core::wire::state::OperationMode;
 use crate::{Cell, Rng};
 use recipe_config::InitialTarget;
 
-/// Changes the variables used by ports, and the controller's state.
+/// Changes the variables that ports send, and the state of the controller.
 #[derive(Debug)]
 pub(super) struct World {
     rng: Rng,
@@ -53,17 +53,17 @@ impl World {
                 let var = self.shown[self.rng.below(self.shown.len() as u64) as usize];
                 let before = cell.controller().registers().var(var).as_f64();
                 let value = match var.ty() {
-                    // One bit at a time, so each bit has its own edges.
+                    // Changes one bit at a time, so each bit has its own edges.
                     ScalarType::Byte => {
                         let bit = 1 << self.rng.below(8);
                         f64::from((before as u8 ^ bit) & var.valid_bits())
                     }
-                    // Most texts fit.
+                    // Most of these lengths fit.
                     ScalarType::Word if self.lengths.contains(&var) => self.rng.below(6) as f64,
                     ScalarType::Word => self.rng.below(65_536) as f64,
                     _ => self.rng.below(20_000) as f64 / 16.0,
                 };
-                // Refused if the variable cannot have this value; then nothing changes.
+                // If the variable cannot have this value, nothing changes.
                 let _ = cell.controller_mut().force(InitialTarget::Var(var), value);
             }
         }
