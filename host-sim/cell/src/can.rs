@@ -82,8 +82,7 @@ impl CanBus {
     }
 
     /// The frames that the port has sent since the last call, each with the time of its end. The newest [`MAX_HEARD`]
-    /// are
-    /// kept.
+    /// are kept.
     pub fn take_heard(&mut self) -> Vec<(Instant, CanFrame)> {
         self.heard.drain(..).collect()
     }

@@ -31,8 +31,7 @@ pub trait Device<M> {
 }
 
 /// A device that is a TCP server, such as a Modbus TCP server. It has one connection at a time: a new connection
-/// replaces
-/// the previous one.
+/// replaces the previous one.
 pub trait Server {
     /// A connection was opened.
     fn opened(&mut self, now: Instant);
@@ -74,8 +73,7 @@ pub enum Act {
         in_time: bool,
     },
     /// The gateway received something from the device that is no reply to the request. It may or may not count as a
-    /// sign that
-    /// the device is up.
+    /// sign that the device is up.
     Garbled,
     /// From now on, the value with this number is this.
     Holds(usize, u16),

@@ -376,8 +376,7 @@ impl Cell {
     }
 
     /// A datagram arrives at a listening port of the gateway. The gateway answers the first sender; later it switches
-    /// only to
-    /// the sender of a valid frame.
+    /// only to the sender of a valid frame.
     fn client_datagram(&mut self, link: LinkId, from: Sender, bytes: &[u8]) {
         let gate = self.gate(link);
         if gate.is_cut(Way::Down) && from != Sender::Stranger || !gate.is_open {

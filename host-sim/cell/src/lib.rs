@@ -23,8 +23,7 @@
 //!
 //! Each fault is a method of [`Cell`] (such as [`Cell::refuse`] or [`Cell::half_open`]), a field of a [`Line`], a
 //! [`CanBus`] or a [`Network`] (noise, loss, splits), or a method of [`Cell::controller_mut`]. [`FaultInjector`]
-//! injects
-//! all of them at random.
+//! injects all of them at random.
 
 mod access;
 mod can;
@@ -339,8 +338,7 @@ impl Cell {
 }
 
 /// The gateway's address for the controller's UDP server. Each time the link is opened, the address changes, like that
-/// of
-/// a new socket.
+/// of a new socket.
 fn udp_peer(generation: u64) -> SocketAddr {
     (CLIENT_IP, 40_000 + (generation % 10_000) as u16).into()
 }

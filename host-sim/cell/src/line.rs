@@ -132,8 +132,7 @@ impl Line {
     }
 
     /// The transmissions of the port since the last call, each with the time of its last byte. The newest [`MAX_HEARD`]
-    /// are
-    /// kept.
+    /// are kept.
     pub fn take_heard(&mut self) -> Vec<(Instant, Vec<u8>)> {
         self.heard.drain(..).collect()
     }

@@ -25,8 +25,7 @@ pub struct Network {
     /// The gateway's driver reports acknowledgements this long after they arrive, and before it reports received data.
     pub ack_report: Duration,
     /// How many unacknowledged bytes the gateway's transport buffers. Beyond that, the driver reports a transmission as
-    /// sent
-    /// only when there is room again.
+    /// sent only when there is room again.
     pub send_buffer: u64,
 }
 

@@ -51,8 +51,7 @@ impl Recorder {
 }
 
 /// The first difference between two recordings as text: the entry, the input before it, and both contents. `None` if
-/// the
-/// recordings are equal.
+/// the recordings are equal.
 pub fn recording_difference(expected: &[u8], found: &[u8]) -> Option<String> {
     if expected == found {
         return None;

@@ -1,6 +1,5 @@
 //! The CRC of Modbus RTU, from proto-core/docs/wire/modbus-rtu.md: for the model and the simulated devices of a soak
-//! run,
-//! independent of the engine's implementation.
+//! run, independent of the engine's implementation.
 
 /// A frame with its CRC, the low byte first.
 pub(crate) fn sealed(bytes: &[u8]) -> Vec<u8> {

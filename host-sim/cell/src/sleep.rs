@@ -1,10 +1,8 @@
 //! A gateway that is not called for a while: its process is stopped, or its machine is busy or suspended. Everything
-//! else
-//! goes on, and its input waits in buffers like those of a kernel.
+//! else goes on, and its input waits in buffers like those of a kernel.
 //!
 //! The buffers hold 4 KiB per line, 256 frames per bus and 256 datagrams per link; more is lost. Connections lose
-//! nothing:
-//! data stays with the sender. The kernel still sends, acknowledges and retransmits what was sent before.
+//! nothing: data stays with the sender. The kernel still sends, acknowledges and retransmits what was sent before.
 
 use proto_core::engine::{BusState, Input, LinkId, PortId};
 use proto_core::time::Duration;
@@ -36,8 +34,7 @@ pub(super) enum PortEvent {
 
 impl Cell {
     /// Stops calling the gateway for this long. After that it gets everything that waits, and a tick. Called during a
-    /// stall,
-    /// it prolongs the stall.
+    /// stall, it prolongs the stall.
     pub fn stall_gateway(&mut self, span: Duration) {
         self.trace.add(self.now, What::Fault, super::Entry::GATEWAY, &span.as_micros().to_le_bytes());
         self.stalls += 1;

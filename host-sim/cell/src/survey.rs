@@ -12,8 +12,7 @@ use recipe_controller::Link;
 
 impl Cell {
     /// Announces that a server of the controller has a fault, such as [`recipe_controller::Controller::mute`], so the
-    /// model
-    /// expects less of the gateway. Call [`Self::server_fault_ends`] once for each call.
+    /// model expects less of the gateway. Call [`Self::server_fault_ends`] once for each call.
     pub fn server_fault_begins(&mut self, server: Link) {
         self.server_faults[server as usize] += 1;
         self.note_fault(None);

@@ -2,9 +2,8 @@
 //! retransmitted after growing pauses.
 //!
 //! In: the sent data, and whether the path is cut. Out: when something arrives or is retransmitted. Does not know
-//! windows
-//! or congestion: after a loss everything waits for the next retransmission, as in a real stack while nothing is
-//! acknowledged.
+//! windows or congestion: after a loss everything waits for the next retransmission, as in a real stack while nothing
+//! is acknowledged.
 
 use std::collections::VecDeque;
 
@@ -141,8 +140,7 @@ impl Pipe {
     }
 
     /// Takes the next item that has arrived; bytes that arrived together are one item. Also returns how many bytes of
-    /// the
-    /// other direction are acknowledged.
+    /// the other direction are acknowledged.
     pub(super) fn next_arrived(&mut self, now: Instant) -> (Arrived, u64) {
         let mut acks = 0;
         if self.held || self.dead {

@@ -37,8 +37,7 @@ impl TcpDevice {
 
 impl Cell {
     /// Attaches a device to a Modbus TCP link; it replaces the previous device. Without a device, connections are
-    /// accepted
-    /// but never answered.
+    /// accepted but never answered.
     ///
     /// # Panics
     /// If the link does not lead to a device.

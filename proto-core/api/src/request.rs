@@ -1,10 +1,8 @@
 //! The head of an HTTP/1.1 request: the request line and the header fields.
 //!
 //! In: received bytes, in pieces of any size. Out: an [`HttpHead`], or the reason why there is none. Does not know
-//! paths,
-//! keys or bodies. An ambiguous request is refused, not interpreted: a field that matters may occur once, lines end
-//! with
-//! CR LF, and a body has a `Content-Length`.
+//! paths, keys or bodies. An ambiguous request is refused, not interpreted: a field that matters may occur once, lines
+//! end with CR LF, and a body has a `Content-Length`.
 
 use core::str;
 

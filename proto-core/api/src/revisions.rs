@@ -269,8 +269,7 @@ impl Revisions {
     }
 
     /// Continues a trial that began before a restart of the program: `number` runs until `until`. Returns `false` if
-    /// that
-    /// revision is not stored, or is the live one.
+    /// that revision is not stored, or is the live one.
     pub fn resume_trial(&mut self, number: u32, until: Instant) -> bool {
         let is_other = number != self.live && self.revision(number).is_some();
         if is_other {

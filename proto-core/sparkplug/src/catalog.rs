@@ -1,8 +1,7 @@
 //! What an edge node publishes: its devices and its metrics.
 //!
 //! A catalog is fixed for the lifetime of a node; another catalog needs another node with another session. The places
-//! of
-//! metrics count from 0: first the metrics of the node itself, then those of each device, without gaps.
+//! of metrics count from 0: first the metrics of the node itself, then those of each device, without gaps.
 
 use heapless::String;
 use proto_core::time::Duration;

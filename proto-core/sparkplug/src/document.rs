@@ -2,8 +2,7 @@
 //! 6).
 //!
 //! In: settings, or bytes. Out: bytes, or settings. Bytes that [`NodeDocument::encode`] would not write are refused as
-//! a
-//! whole. Numbers are little-endian; texts follow their length.
+//! a whole. Numbers are little-endian; texts follow their length.
 //! ```text
 //! "RGWE" 1 0                                      tells nothing
 //! "RGWE" 1 1 host port client_id login keep_alive_s group node primary_host

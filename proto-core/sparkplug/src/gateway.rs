@@ -113,8 +113,7 @@ pub struct NoRoom;
 
 impl<'c, const METRICS: usize> GatewayCatalog<'c, METRICS> {
     /// The catalog of a gateway that runs this configuration. `status` is from that gateway, at any time; `version` is
-    /// the
-    /// version of the program.
+    /// the version of the program.
     ///
     /// # Errors
     /// If there are more metrics than there is room for.

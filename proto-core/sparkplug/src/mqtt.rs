@@ -1,8 +1,7 @@
 //! MQTT 3.1.1, as far as an edge node needs it: the packets that it sends, and those that it may receive.
 //!
 //! In: the contents of packets, and bytes of the server in pieces of any size. Out: packets. Subscriptions use QoS 1
-//! and
-//! publications QoS 0, so nothing waits for an acknowledgement, and QoS 2 is an error of the server.
+//! and publications QoS 0, so nothing waits for an acknowledgement, and QoS 2 is an error of the server.
 
 use crate::bytes::ByteWriter;
 
@@ -116,8 +115,7 @@ impl<const ROOM: usize> Inbox<ROOM> {
     }
 
     /// Takes as many bytes as fit, and returns how many. If [`Inbox::next_packet`] is called until it returns no
-    /// packet,
-    /// there is always room.
+    /// packet, there is always room.
     pub fn push(&mut self, bytes: &[u8]) -> usize {
         self.drop_used();
         let skipped = self.skip.min(bytes.len());

@@ -58,8 +58,7 @@ pub struct FaultInjector {
 
 impl FaultInjector {
     /// Injects faults of these kinds from now on, one per `pause` on average. Most faults last up to `pause`, outages
-    /// up to
-    /// 20 times as long.
+    /// up to 20 times as long.
     pub fn new(cell: &mut Cell, kinds: &[FaultKind], pause: Duration) -> Self {
         let mut injector = Self {
             rng: cell.fork_rng(),

@@ -451,8 +451,7 @@ impl Judge {
 
 impl Cell {
     /// From now on, judges what the device of a cell executes by its own log and the robot's. Time stops after the
-    /// first
-    /// violation. Call it before time advances.
+    /// first violation. Call it before time advances.
     pub(crate) fn judge_device(&mut self, rules: Rules) {
         self.judge = Some(Box::new(Judge::new(rules, self.now)));
         self.queue.push(self.now, crate::due::Due::Survey);

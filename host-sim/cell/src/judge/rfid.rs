@@ -1,6 +1,5 @@
 //! The RFID head of `judged-rfid.toml`. A request is `$`, a letter, four hexadecimal digits, a CRC of four more digits,
-//! and
-//! a carriage return. The reply has `!` in place of `$`; a refusal has `?` and two digits.
+//! and a carriage return. The reply has `!` in place of `$`; a refusal has `?` and two digits.
 
 use proto_core::time::{Duration, Instant};
 

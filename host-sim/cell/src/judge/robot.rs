@@ -102,8 +102,7 @@ impl Robot {
     }
 
     /// How long data sent since then may have waited in the transport: while the gateway is not called, it cannot take
-    /// data
-    /// back.
+    /// data back.
     pub(super) fn transport(&self, rules: &Rules, since: Instant) -> Duration {
         if self.not_called >= since { rules.transport } else { Duration::ZERO }
     }
@@ -139,8 +138,7 @@ impl Robot {
         conn.came.extend_from_slice(bytes);
         while let Some(frame) = next_frame(&mut conn.came) {
             // The gateway has one request in flight, and gives it up after half a second. An earlier request shows that
-            // it has received
-            // the reply.
+            // it has received the reply.
             let before = conn.newest.replace(now);
             if let Some(before) = before.filter(|before| now.saturating_since(*before) < SURELY_TAKEN) {
                 for nth in conn.open.drain(..) {
@@ -163,8 +161,7 @@ impl Robot {
     }
 
     /// The controller sends on a connection. Returns when it sent replies with a new stop. `heard`: when the device
-    /// last
-    /// received a stop.
+    /// last received a stop.
     pub(super) fn answered(
         &mut self,
         id: u64,
@@ -225,8 +222,7 @@ impl Robot {
     }
 
     /// Finds and uses up the rise for which an order with these values is executed now. If several fit, it is the first
-    /// one
-    /// before which the device had received every stop; `heard` is when it last received one.
+    /// one before which the device had received every stop; `heard` is when it last received one.
     pub(super) fn rise_for(
         &mut self,
         rules: &Rules,

@@ -47,8 +47,7 @@ impl Rules {
             values: values.iter().map(|name| var(name)).collect(),
             safe: 7,
             // The sum of: the time until the port is overdue, all repetitions, the way to the controller, and a stall
-            // of the
-            // gateway and of its transport.
+            // of the gateway and of its transport.
             value_age: PORT_TIMEOUT + timeout.saturating_mul(9) + Duration::from_millis(3_500),
             stale_after: Duration::from_millis(300),
             absent: Duration::from_secs(3),

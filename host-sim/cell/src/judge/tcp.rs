@@ -1,6 +1,5 @@
 //! A Modbus TCP server with orders and queries of its own, written from the specification: the header, one or more
-//! units,
-//! and the errors that servers make.
+//! units, and the errors that servers make.
 
 use proto_core::time::{Duration, Instant};
 

@@ -56,7 +56,7 @@ impl Oracle {
         self.registers(before, expected.as_ref(), after, now);
     }
 
-    /// Same, for a datagram.
+    /// As [`Self::arrived`], for a datagram.
     pub(crate) fn arrived_datagram(
         &mut self,
         link: LinkId,
@@ -79,7 +79,7 @@ impl Oracle {
         self.registers(before, expected.as_ref(), after, now);
     }
 
-    /// A write is applied as a whole or, if the controller refuses it, not at all.
+    /// A write is applied as a whole or, if the controller refuses it, has no effect.
     fn registers(&mut self, before: &Inputs, expected: Option<&Inputs>, after: &[u8], now: Instant) {
         let result = if after == before || expected.is_some_and(|expected| after == expected) {
             Ok(())
@@ -90,7 +90,7 @@ impl Oracle {
     }
 }
 
-/// The controller takes a frame.
+/// The controller accepts a frame.
 fn put_frame(inputs: &mut Inputs, frame: &Frame, payload: &[u8]) {
     let mut rest = payload;
     for &var in &frame.written {

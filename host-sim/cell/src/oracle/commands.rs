@@ -1,5 +1,5 @@
-//! Commands that field values pick: each is sent once or not at all, and urgent ones go first
-//! (proto-core/docs/engine.md section 7).
+//! Commands that field values select: each is sent once or not at all, and urgent ones go first (proto-
+//! core/docs/engine.md section 7).
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -14,27 +14,27 @@ use super::spec::Spec;
 
 /// Maximum number of waiting commands.
 const QUEUE: usize = 8;
-/// A command that waits longer is dropped; an urgent one, if it was not requested for this time.
+/// A command that waits longer than this is dropped; an urgent one if it was not requested for this long.
 const TTL: Duration = Duration::from_secs(1);
 
-/// A command field: indices of port, frame and field.
+/// The place of a command field: indices of port, frame and field.
 pub(super) type Place = (usize, usize, usize);
 
-/// A command that a value picked.
+/// A command that a value selected.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Command {
     pub place: Place,
     value: i64,
     pub text: String,
-    /// When it was picked.
+    /// When the command was selected.
     pub picked: Instant,
-    /// For an urgent one: since when it is no longer requested, or since when it waits again.
+    /// For an urgent command: since when it is no longer requested, or since when it waits again.
     since: Instant,
-    /// When it was sent, of one that is unanswered.
+    /// When the command was sent, while it is unanswered.
     sent: Instant,
 }
 
-/// Commands that wait, commands that are unanswered, and counters.
+/// Waiting commands, unanswered commands, and counters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Commands {
     queue: VecDeque<Command>,
@@ -44,29 +44,30 @@ pub(super) struct Commands {
     overtaken: usize,
     /// The value in the previous frame.
     base: BTreeMap<Place, i64>,
-    /// The fields that had a base when the gateway slept, and no frame since: what changed them may be discarded.
+    /// Fields that had a base when the gateway slept, and no frame since. The frame that changed their value may be
+    /// discarded.
     woke: BTreeSet<Place>,
     /// The fields whose base survives silence.
     kept: BTreeSet<Place>,
-    /// By port.
+    /// The results per port.
     pub counted: [Counted; MAX_PORTS],
     /// Text of the newest command sent.
     newest: Option<String>,
-    /// Texts of the commands that were picked by frames that waited while the gateway slept.
+    /// Texts of the commands that were selected by frames that waited while the gateway slept.
     slept: Vec<String>,
     /// Number of replies that the engine has counted, and text received since, on each of the two links.
     answered: [u32; 2],
     heard: [String; 2],
 }
 
-/// What became of a port's values.
+/// The results of a port's command values.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Counted {
     pub picked: u32,
     pub dropped: u32,
-    /// Values in no table.
+    /// Number of values that are in no table.
     pub unknown: u32,
-    /// Values that only set the base.
+    /// Number of values that only set the base.
     pub based: u32,
 }
 
@@ -77,7 +78,7 @@ impl Command {
 }
 
 impl Commands {
-    /// Queues the commands that an accepted frame picks; returns the urgent ones.
+    /// Queues the commands that an accepted frame selects; returns the urgent ones.
     pub(super) fn accepted(
         &mut self,
         spec: &Spec,
@@ -132,7 +133,7 @@ impl Commands {
             }
         }
         if !urgent.is_empty() {
-            // They overtake everything, also commands of later fields of the frame.
+            // Urgent commands overtake all others, including those of later fields of the frame.
             self.overtaken = self.queue.len();
         }
         urgent
@@ -183,12 +184,12 @@ impl Commands {
         }
     }
 
-    /// Whether the device still sends the value that picked the command.
+    /// Whether the device still sends the value that selected the command.
     pub(super) fn is_asked(&self, command: &Command) -> bool {
         self.base.get(&command.place) == Some(&command.value)
     }
 
-    /// Drops commands that waited too long.
+    /// Drops commands that have waited too long.
     pub(super) fn tick(&mut self, now: Instant) {
         while self.queue.front().is_some_and(|first| now >= first.picked + TTL) {
             self.drop_first();
@@ -200,7 +201,7 @@ impl Commands {
         }
     }
 
-    /// A link is lost: unanswered urgent commands wait again if they are still requested.
+    /// A link was lost: unanswered urgent commands wait again if they are still requested.
     pub(super) fn lost(&mut self, link: LinkId, now: Instant) {
         let gone: Vec<Command> = self
             .unanswered
@@ -209,7 +210,7 @@ impl Commands {
             .map(|(_, command)| command.clone())
             .collect();
         self.unanswered.retain(|(on, _)| *on != link);
-        // Of two equal ones the newer one is sent again.
+        // Of two equal commands, the newer one is sent again.
         for command in gone.into_iter().rev() {
             let waits = self.urgent.iter().any(|other| other.same_kind(&command));
             if command.is_urgent() && self.is_asked(&command) && !waits {
@@ -224,7 +225,7 @@ impl Commands {
         self.heard[side(link)].clear();
     }
 
-    /// The gateway slept: commands picked before are dropped.
+    /// The gateway slept: commands selected before are dropped.
     pub(super) fn slept(&mut self, now: Instant) {
         self.woke.extend(std::mem::take(&mut self.base).into_keys());
         self.lost(LinkId::COMMAND, now);
@@ -235,7 +236,7 @@ impl Commands {
         self.slept.clear();
     }
 
-    /// Remembers the commands that a discarded frame would have picked.
+    /// Remembers the commands that a discarded frame would have selected.
     pub(super) fn waited_in_sleep(&mut self, spec: &Spec, frame: &Accepted) {
         for &(_, table, _, value) in &frame.commands {
             let picked = table.of(&spec.commands).iter().find(|entry| entry.has(value));
@@ -254,7 +255,7 @@ impl Commands {
         self.heard[side(link)].push_str(&String::from_utf8_lossy(bytes));
     }
 
-    /// Matches the replies that the engine has counted with unanswered commands. A whole reply that it has
+    /// Matches the replies that the engine has counted with unanswered commands. A complete reply that the engine has
     /// not counted is an error.
     pub(super) fn match_replies(&mut self, engine: &Engine) -> Result<(), Wrong> {
         if self.unanswered.is_empty() {
@@ -275,7 +276,7 @@ impl Commands {
                 let first = self.unanswered.iter().position(|sent| mine(&sent));
                 let Some(nth) = named.or(first) else { continue };
                 let (_, command) = self.unanswered.remove(nth);
-                // The same piece may contain the reply to another command.
+                // The same received piece may also contain the reply to another command.
                 let heard = &mut self.heard[place];
                 *heard = heard.replacen(word(&command.text), "", 1);
             }
@@ -331,7 +332,7 @@ impl Commands {
         Ok(command)
     }
 
-    /// Until when an urgent command may wait because one like it is unanswered, which is then given up.
+    /// Until when an urgent command may wait because an equal one is unanswered, which is then given up.
     pub(super) fn waits_until(&self, command: &Command) -> Instant {
         let alike = self.unanswered.iter().filter(|(_, sent)| sent.text == command.text);
         alike.map(|(_, sent)| sent.sent + TTL).max().unwrap_or(Instant::ZERO)
@@ -355,7 +356,7 @@ impl Commands {
 }
 
 impl Command {
-    /// The reply to it in a text that the controller sent, in the form of any version.
+    /// The reply to this command in a text that the controller sent, in the format of any software version.
     fn reply_in(&self, heard: &str) -> Option<String> {
         let word = word(&self.text);
         let forms = match word {
@@ -375,7 +376,7 @@ fn side(link: LinkId) -> usize {
     usize::from(link == LinkId::URGENT)
 }
 
-/// The command's keyword.
+/// The keyword of the command.
 fn word(text: &str) -> &str {
     text.split('(').next().unwrap_or(text)
 }
@@ -384,7 +385,7 @@ fn is_urgent(text: &str) -> bool {
     matches!(text, "stop" | "pause" | "disable" | "poweroff")
 }
 
-/// A command's text without what dialects add.
+/// The text of a command without the additions of dialects.
 pub(super) fn plain(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text);
     text.chars()

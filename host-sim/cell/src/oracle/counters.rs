@@ -1,8 +1,8 @@
-//! Whether two sets of a port's counters differ: the model compares all of them after each input of the engine.
+//! Compares two sets of a port's counters. The model compares all counters after each input of the engine.
 
 use proto_core::engine::PortCounters;
 
-/// Whether one of these differs, without a branch for each.
+/// Whether any of these fields differs, without a branch for each.
 macro_rules! any_differs {
     ($one:ident, $other:ident: $($name:ident)*) => {
         ($($one.$name ^ $other.$name)|*) != 0

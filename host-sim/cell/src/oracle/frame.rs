@@ -1,4 +1,4 @@
-//! A frame of the configuration: its fields, and the variables that they write or show.
+//! A frame of the configuration: its fields, and the variables that they write or send.
 
 use proto_core::config::{FieldSpec, InputBinding, InputRule, OutputBinding, Words};
 use proto_core::sysvar::SysVar;
@@ -6,7 +6,7 @@ use proto_core::wire::can::CanId;
 
 use super::device::{DeviceSpec, varies};
 
-/// A value as on the wire; unused bytes are 0.
+/// A value as it is on the wire; unused bytes are 0.
 pub(super) type Raw = [u8; 4];
 
 /// One frame on the field side or on a recipe link.
@@ -16,14 +16,14 @@ pub(super) struct Frame {
     pub tail: Vec<u8>,
     pub id: Option<CanId>,
     pub fields: Vec<FieldSpec>,
-    /// The variables that they write, and those that they show.
+    /// The variables that the fields write, and those that they send.
     pub written: Vec<SysVar>,
     pub shown: Vec<SysVar>,
-    /// Number of bytes of all fields, checksum included.
+    /// Number of bytes of all fields, including the checksum.
     pub payload: usize,
     /// The places of the fields in a device's own frame.
     pub device: Option<DeviceSpec>,
-    /// The places of its fields are not the same in every frame.
+    /// The places of the fields vary from frame to frame.
     pub varies: bool,
 }
 
@@ -40,14 +40,14 @@ impl Frame {
         self.shown.contains(&var)
     }
 
-    /// The fields' bytes; `None` if head, tail or length differ.
+    /// The bytes of the fields; `None` if head, tail or length differ.
     pub(super) fn payload_of<'b>(&self, bytes: &'b [u8]) -> Option<&'b [u8]> {
         let rest = bytes.strip_prefix(self.head.as_slice())?.strip_suffix(self.tail.as_slice())?;
         (self.varies || rest.len() == self.payload).then_some(rest)
     }
 }
 
-/// The variables that an input field writes: one, or those of a text.
+/// The variables that an input field writes: one variable, or those of a text.
 pub(super) fn written(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
     let (words, others) = match *field {
         FieldSpec::System(var)
@@ -71,7 +71,7 @@ pub(super) fn written(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<>
     words.into_iter().flat_map(Words::iter).chain(others.into_iter().flatten())
 }
 
-/// The variables that an output field shows.
+/// The variables that an output field sends.
 pub(super) fn shown(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
     let (words, other) = match *field {
         FieldSpec::System(var) => (None, Some(var)),
@@ -100,7 +100,7 @@ pub(super) fn shown(field: &FieldSpec) -> impl Iterator<Item = SysVar> + use<> {
     words.into_iter().flat_map(Words::iter).chain(other)
 }
 
-/// The size of a plain recipe's field.
+/// The size of a field in a plain recipe.
 pub(super) fn size(field: &FieldSpec) -> usize {
     match field {
         FieldSpec::System(var) => var.size(),
@@ -117,7 +117,7 @@ pub(super) fn frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[Field
     Frame { payload, ..any_frame(head, tail, id, fields) }
 }
 
-/// A frame of a device's recipe, also one that a plain recipe could have.
+/// A frame of a device's recipe, even if a plain recipe could describe it.
 pub(super) fn device_frame(head: &[u8], tail: &[u8], id: Option<CanId>, fields: &[FieldSpec]) -> Frame {
     let varies = fields.iter().any(varies);
     let device = if varies { DeviceSpec::default() } else { DeviceSpec::new(head.len(), fields) };

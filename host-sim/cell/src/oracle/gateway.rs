@@ -1,4 +1,4 @@
-//! The gateway's side: what each input of the engine must lead to, and checks of what its field ports send.
+//! The gateway's side: the expected result of each input of the engine, and checks of what its field ports send.
 
 use proto_core::device::Boundary;
 use proto_core::engine::{Engine, LinkId, PortId};
@@ -13,17 +13,17 @@ use super::invariant::Wrong;
 use super::wire::Safe;
 use super::{Invariant, LinkWatch, Oracle, PortWatch, place};
 
-/// What a field port sends.
+/// A transmission of a field port.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Leaving<'a> {
-    /// Of a CAN frame.
+    /// The id, for a CAN frame.
     pub id: Option<CanId>,
     pub is_remote: bool,
     pub bytes: &'a [u8],
 }
 
 impl Oracle {
-    /// Handles deadlines that have passed; `has_slept` says that what waited is not read.
+    /// Handles deadlines that have passed. After a sleep (`has_slept`), waiting input is not read.
     pub(super) fn pass(&mut self, has_slept: bool, now: Instant) {
         let overdue = self.up.overdue(&self.spec, now);
         for &(nth, frame) in &overdue {
@@ -56,7 +56,7 @@ impl Oracle {
         self.commands.tick(now);
     }
 
-    /// The gateway slept: frames that had begun are not continued.
+    /// The gateway slept: frames that were received in part are not continued.
     pub(super) fn slept(&mut self, now: Instant) {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             watch.down.slept();
@@ -82,7 +82,8 @@ impl Oracle {
         self.robot.no_longer_asked(|command| commands.is_asked(command), now);
     }
 
-    /// Finds the links that the engine has given up by itself. `reported` is the link of the input, which handles it.
+    /// Finds the links that the engine has given up on its own. `reported` is the link of the current input, which
+    /// handles that link itself.
     pub(super) fn find_lost_links(&mut self, engine: &Engine, reported: Option<LinkId>, now: Instant) {
         let mut left = self.up.are_up;
         while left != 0 {
@@ -122,7 +123,7 @@ impl Oracle {
         self.up.bits_again(&self.spec, safe.bits);
     }
 
-    /// Shown values may have changed: looks for rising bits that trigger a port.
+    /// Sent values may have changed: looks for rising bits that trigger a port.
     pub(super) fn values_changed(&mut self, now: Instant) {
         self.exchange_values_changed(now);
         if !self.spec.has_triggers {
@@ -200,13 +201,13 @@ impl Oracle {
         }
     }
 
-    /// The device of a port is there.
+    /// The device of a port is present.
     pub(super) fn port_up(&mut self, nth: usize, now: Instant) {
         self.ports[nth].down.is_up = true;
         self.begin_exchanges(nth, now);
     }
 
-    /// The exchanges begin anew.
+    /// Restarts the exchanges of a port.
     pub(super) fn begin_exchanges(&mut self, nth: usize, now: Instant) {
         let watch = &mut self.ports[nth];
         watch.line.discarded += watch.served.discard();
@@ -214,11 +215,11 @@ impl Oracle {
             watch.down.sent();
         }
         watch.exchanges.begin(self.spec.ports[nth].exchanges.as_ref(), now);
-        // What rises from now on asks.
+        // From now on, rising bits request exchanges.
         self.exchange_values_changed(now);
     }
 
-    /// Silence may have ended a frame, or cut one off.
+    /// Silence may have ended a frame, or cut it off.
     fn line_silent(&mut self, nth: usize, has_slept: bool, now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let framing = port.framing;
@@ -230,7 +231,7 @@ impl Oracle {
             return watch.line.cut_off();
         }
         if has_slept {
-            // Nobody knows how long it has waited.
+            // Its age is unknown.
             watch.line.cut_off();
             watch.down.heard = now;
             return;
@@ -252,7 +253,7 @@ impl Oracle {
         }
     }
 
-    /// Applies frames that came in one piece.
+    /// Applies frames that arrived together.
     pub(super) fn take(&mut self, nth: usize, verdicts: impl IntoIterator<Item = Verdict>, now: Instant) {
         let (mut frames, mut ignored) = (0, 0);
         let mut newest: Option<Vec<(SysVar, Raw)>> = None;
@@ -324,7 +325,7 @@ impl Oracle {
             self.up.accepted(&self.spec, nth, &frame, now);
             self.values_changed(now);
             newest = Some(frame.values);
-            // The engine does this after each frame if there are triggers, otherwise after all of them.
+            // The engine does this after each frame if there are triggers, otherwise once after all of them.
             if self.spec.has_triggers {
                 self.after_frames(now);
             }
@@ -346,7 +347,7 @@ impl Oracle {
         }
     }
 
-    /// Drops overtaken commands and values that have waited too long.
+    /// Drops overtaken commands, and values that have waited too long.
     fn after_frames(&mut self, now: Instant) {
         self.commands.drop_overtaken();
         self.up.expire(&self.spec, now);
@@ -380,7 +381,7 @@ impl Oracle {
         self.judge(now, &invariants, result);
     }
 
-    /// Compares the engine's counters with the model's.
+    /// Compares the engine's counters with those of the model.
     pub(super) fn count(&mut self, nth: usize, engine: &Engine) -> Result<(), Wrong> {
         let Some(actual) = engine.port_counters(PortId(nth as u8)) else { return Ok(()) };
         let PortWatch { line, down, counters, exchanges, .. } = &self.ports[nth];

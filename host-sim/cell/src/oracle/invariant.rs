@@ -1,19 +1,19 @@
-//! The invariants that are checked, their names in reports, and a violation of one.
+//! The invariants, their names in reports, and violations.
 
 use proto_core::time::Instant;
 
 /// The invariants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Invariant {
-    /// Each value written is the next one that its owner sent, a safe value, or one that was read back.
+    /// Each written value is the next one that its owner sent, a safe value, or a value that was read back.
     Sent,
     /// No value is written after its time to live.
     InTime,
-    /// No value is written before the first valid field frame with it.
+    /// No value is written before the first valid field frame that contains it.
     FirstFrame,
-    /// Only variables that a port owns are written, whole, on their way up.
+    /// Only variables that a port owns are written, completely, on their route.
     Ownership,
-    /// Nothing that was received before a reconnect is written after it.
+    /// Nothing received before a reconnect is written after it.
     NoReplay,
     /// The edges of bits are written in order, or counted.
     Edges,
@@ -27,13 +27,13 @@ pub enum Invariant {
     Once,
     /// No value is shown before it was received.
     Known,
-    /// No value older than promised is shown.
+    /// No shown value is older than promised.
     Age,
     /// The value shown is the newest one received.
     Shown,
-    /// Never faster than the cycle, and each cycle, request and trigger is served or counted.
+    /// A port never sends faster than its cycle, and each cycle, request and trigger is served or counted.
     Cycle,
-    /// One transmission at a time, on a silent line, to a device that is there.
+    /// A port sends one transmission at a time, on a silent line, to a device that is present.
     Line,
     /// The controller receives what the gateway sent.
     Transport,
@@ -41,9 +41,9 @@ pub enum Invariant {
     Registers,
     /// No value that the controller applies is older than promised.
     ValueAge,
-    /// No command that the controller receives was picked, or last requested, too long ago.
+    /// No command reaches the controller too long after it was selected or last requested.
     CommandAge,
-    /// No command that was picked before an urgent one arrives after it.
+    /// No command that was selected before an urgent one arrives after it.
     Overtaken,
     /// The controller understands every command that arrives.
     Understood,
@@ -53,11 +53,11 @@ pub enum Invariant {
     SafeArrives,
     /// An unreadable value is neither shown nor written back.
     Unreadable,
-    /// No value of another field port older than promised is shown.
+    /// No shown value of another field port is older than promised.
     OwnAge,
     /// A short stall of the gateway does not make a device overdue.
     FalseTimeout,
-    /// Nothing that waited while the gateway slept is applied or commanded.
+    /// Nothing that waited while the gateway slept is applied or selects a command.
     FromSleep,
     /// Datagrams are sent only to the controller's client.
     Destination,
@@ -65,23 +65,25 @@ pub enum Invariant {
     Work,
     /// Every queue is bounded.
     Memory,
-    /// What a slave of a line answered is taken, and only that; what reaches the controller was held there.
+    /// Exactly the replies of a slave on a line are accepted, and a value that reaches the controller was held by the
+    /// slave.
     Held,
-    /// What a slave takes was asked for, and is what the controller had, together and not long ago.
+    /// What a slave accepts was requested, and consists of values that the controller had at the same time, not long
+    /// ago.
     Carried,
-    /// The slaves of a line are asked as often as their periods say, and looked for while they are silent.
+    /// The slaves of a line are polled as often as their periods say, and probed while they are silent.
     Periods,
-    /// A slave that answers soon has the controller's values.
+    /// A slave that replies promptly has the controller's values.
     Updated,
-    /// A device executes an event at most once for a rise, in time, with the robot's values since the rise.
+    /// A device executes an event at most once per rise, in time, with values that the robot had since the rise.
     EventsOnce,
-    /// A stop comes before every event, and soon.
+    /// A stop is sent soon, and before every event.
     StopsFirst,
-    /// What a device is sent at its start is executed once for each start.
+    /// The start exchanges of a device are executed once per start.
     StartsOnce,
-    /// What the robot is shown of a device was so, not long ago.
+    /// A value of a device that the robot is shown was held by the device not long ago.
     DeviceValues,
-    /// A device keeps what the robot has.
+    /// A device keeps the value that the robot has.
     DeviceKeeps,
     /// Nothing panics.
     NoPanic,
@@ -91,7 +93,7 @@ pub enum Invariant {
 pub(super) type Wrong = (Invariant, String);
 
 impl Invariant {
-    /// All of them.
+    /// All invariants.
     pub const ALL: [Self; 40] = [
         Self::Sent,
         Self::InTime,
@@ -189,7 +191,7 @@ pub struct Violation {
     pub invariant: Invariant,
     /// When it was violated.
     pub at: Instant,
-    /// A description, with the numbers.
+    /// A description with the values involved.
     pub what: String,
 }
 

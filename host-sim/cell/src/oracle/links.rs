@@ -1,4 +1,4 @@
-//! The gateway's links: what must follow from what they receive, and checks of what they send.
+//! The gateway's links: the expected result of what they receive, and checks of what they send.
 
 use std::rc::Rc;
 
@@ -76,7 +76,7 @@ impl Oracle {
         line.remove(&cut);
     }
 
-    /// One or several frames came on a recipe link.
+    /// One or more frames arrived on a recipe link.
     fn frame_came(&mut self, link: LinkId, now: Instant) {
         let before = self.up.frame_at[place(link)].replace(now);
         self.up.heard(now);
@@ -187,7 +187,7 @@ impl Oracle {
             Some((spec, frame, frame.payload_of(bytes)?))
         });
         let Some((link_spec, frame, payload)) = found else {
-            // The greeting to the UDP server.
+            // The first datagram to the UDP server, which only announces the client.
             let is_greeting = link == LinkId::RECIPE_UDP && bytes.len() <= 2 && bytes.iter().all(|&b| b == 0);
             let wrong = (Invariant::Sent, "sent data that is neither a frame nor a greeting".to_owned());
             return if is_greeting { Ok(()) } else { Err(wrong) };
@@ -220,7 +220,7 @@ impl Oracle {
         Ok(())
     }
 
-    /// Checks that no value waits although it could be sent.
+    /// Checks that no value that could be sent still waits.
     pub(super) fn nothing_waits(&mut self, now: Instant) -> Result<(), Wrong> {
         let mut left = self.up.waits;
         while left != 0 {

@@ -1,12 +1,12 @@
 //! Checks the gateway's promises at every step against an independent model (docs/cell.md section 4).
 //!
-//! In: all inputs and outputs of the engine, and what reaches the controller. Out: how often each
-//! [`Invariant`] was checked, and the first [`Violation`]. The model is slow and simple: it finds
-//! frames by the rules of proto-core/docs/wire/recipes.md, keeps a queue per variable, and uses
-//! neither the engine's recipes nor its plan. Garbage that happens to be a valid frame counts as one:
-//! the model sees what the port received, not what the device sent.
+//! In: all inputs and outputs of the engine, and what reaches the controller. Out: how often each [`Invariant`] was
+//! checked, and the first [`Violation`]. Does not know the engine's recipes or its plan; of the engine it reads only
+//! the counters and the states of the links.
 //!
-//! It reads nothing of the engine but the counters and the states of the links.
+//! The model is slow and simple: it finds frames by the rules of proto-core/docs/wire/recipes.md, and keeps a queue per
+//! variable. Garbage that happens to be a valid frame counts as one: the model sees what the port received, not what
+//! the device sent.
 
 mod arrivals;
 mod commands;
@@ -93,7 +93,7 @@ impl LinkWatch {
 /// The model and its results.
 #[derive(Debug, Clone)]
 pub(super) struct Oracle {
-    /// Shared, so that it can be looked at while the rest changes.
+    /// Shared, so it can be read while the rest changes.
     spec: Rc<Spec>,
     map: Map,
     up: Upward,
@@ -107,12 +107,12 @@ pub(super) struct Oracle {
     controller: Controller,
     robot: Robot,
     truth: Truth,
-    /// When the engine was called last.
+    /// When the engine was last called.
     called_at: Option<Instant>,
     /// When the engine asked to be called, and whether another input came first at that time.
     announced: Instant,
     is_late: bool,
-    /// Field input is discarded until this instant: it waited while the gateway slept.
+    /// Until this instant, input from the field is discarded, because it waited while the gateway slept.
     discards_until: Option<Instant>,
     /// The input ended a stall that was too short to count as sleep.
     after_stall: bool,
@@ -121,7 +121,7 @@ pub(super) struct Oracle {
     /// Number of outputs since the newest input, and its limit.
     outputs: u32,
     max_outputs: u32,
-    /// Frames in and out per port, sends and receives per link, across restarts of the gateway.
+    /// Frames received and sent per port, and sends and receives per link, across restarts of the gateway.
     pub frames: Vec<(u64, u64)>,
     pub traffic: [(u64, u64); LINKS],
     pub writes: u64,
@@ -166,7 +166,7 @@ impl Oracle {
         }
     }
 
-    /// Begins with a cell that is switched on: its ports are up, and the engine expects a tick at `announced`.
+    /// Begins with a cell that was just switched on: its ports are up, and the engine expects a tick at `announced`.
     pub(super) fn begin(&mut self, engine: &Engine, announced: Instant, now: Instant) {
         self.called_at = Some(now);
         self.announced = announced;
@@ -235,7 +235,7 @@ impl Oracle {
         if has_slept {
             self.commands.slept(now);
             self.robot.forget_all(now);
-            // A master's request that waited is not executed: nobody knows how old it is.
+            // A master's request that waited is not executed, because its age is unknown.
             for watch in &mut self.ports {
                 watch.line.discarded += watch.served.discard();
             }
@@ -249,7 +249,7 @@ impl Oracle {
             self.slept(now);
         }
         let reported = match input {
-            // After sleep, links have been given up before any input is handled.
+            // After a sleep, links are given up before any input is handled.
             _ if has_slept => None,
             Input::LinkDown { link } | Input::LinkBytes { link, .. } => Some(*link),
             _ => None,
@@ -311,7 +311,7 @@ impl Oracle {
         }
     }
 
-    /// An output of the engine.
+    /// Checks an output of the engine.
     pub(super) fn output(&mut self, now: Instant, output: &Output<'_>) {
         if self.violation.is_some() {
             return;
@@ -334,7 +334,7 @@ impl Oracle {
             Output::LinkClose { link } => self.link_lost(link, now),
             Output::LinkSend { link, bytes } => {
                 self.traffic[place(link)].0 += 1;
-                // Values sent to a lost connection never leave: start with none.
+                // Values sent to a lost connection are never transmitted, so it starts with none.
                 self.robot.hands_over_nothing();
                 if self.spec.link(link).is_some_and(|link| !link.is_datagram) {
                     self.links[place(link)].note_sent(bytes);
@@ -346,7 +346,8 @@ impl Oracle {
         }
     }
 
-    /// The engine has nothing to do before `until`. `pending` is the number of events and connections in the cell.
+    /// The engine has nothing to do before `until`. `pending` is the number of waiting events and connections in the
+    /// cell.
     pub(super) fn rest(&mut self, now: Instant, engine: &Engine, until: Instant, pending: usize) {
         if self.violation.is_some() {
             return;
@@ -391,9 +392,9 @@ pub(super) fn place(link: LinkId) -> usize {
 const LINKS: usize = 16;
 /// Maximum number of unacknowledged frames of a recipe link.
 const MAX_UNACKED: usize = 64;
-/// A gateway that is not called for longer has slept.
+/// A gateway that is not called for longer than this has slept.
 const ASLEEP: Duration = Duration::from_millis(500);
-/// More than can gather in any stall.
+/// More bytes than can wait after any stall.
 const MAX_BYTES: usize = 1 << 20;
 const MAX_PENDING: usize = 100_000;
 

@@ -13,13 +13,14 @@ const SOON: Duration = Duration::from_millis(4);
 /// After [`NEW`], it repeats a safe value that nothing can show after this time.
 const SLOWLY: Duration = Duration::from_millis(100);
 const NEW: Duration = Duration::from_secs(1);
-/// A value that the controller shows earlier may be from before the safe value arrived.
+/// A value that the controller shows earlier than this may be older than the arrival of the safe value.
 const SHOWN_AFTER: Duration = Duration::from_millis(200);
-/// For this long after a confirmation, another value revokes it. Later, another master wrote it.
+/// For this long after a confirmation, another value revokes it. After that, another master must have written the
+/// value.
 const REVOCABLE: Duration = Duration::from_secs(3);
 
 impl Upward {
-    /// Queues safe values again whose write failed, if they are still current.
+    /// If the write of a safe value failed, queues it again, unless it is no longer current.
     pub(super) fn write_again(&mut self, spec: &Spec, vars: impl IntoIterator<Item = SysVar>) {
         for var in vars {
             let safe = spec.owned[var.ordinal()].and_then(|owned| owned.safe);
@@ -58,7 +59,7 @@ impl Upward {
         now.saturating_since(self.unconfirmed_at) < NEW
     }
 
-    /// Queues the safe values that are to be repeated now.
+    /// Queues the safe values that are due for repetition.
     pub(super) fn repeat(&mut self, spec: &Spec, now: Instant) {
         for link in &spec.links {
             let place = usize::from(link.id.0);
@@ -91,7 +92,7 @@ impl Upward {
         now >= self.unconfirmed_at + SHOWN_AFTER
     }
 
-    /// Confirms the safe values that the packet shows. Soon after a confirmation, another value revokes it.
+    /// Confirms the safe values that the packet shows. Soon after a confirmation, a different value revokes it.
     pub(super) fn compare_safe(&mut self, spec: &Spec, packet: &[u8], now: Instant) {
         let may_confirm = self.may_confirm(now);
         let may_revoke = self.confirmed_at.is_some_and(|at| now < at + REVOCABLE);
@@ -117,7 +118,7 @@ impl Upward {
         self.write_again(spec, revoked);
     }
 
-    /// Revokes confirmations of safe values whose witness just arrived with another value, soon after.
+    /// Revokes confirmations of safe values if their witness arrived with a different value soon after.
     pub(super) fn revoke_by_witnesses(&mut self, spec: &Spec, now: Instant) {
         if self.confirmed_at.is_none_or(|at| now >= at + REVOCABLE) {
             return;

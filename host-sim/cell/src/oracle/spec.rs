@@ -1,4 +1,4 @@
-//! What the configuration specifies: owners, ways up and sources (proto-core/docs/engine.md section 4), computed once.
+//! What the configuration specifies: owners, routes and sources (proto-core/docs/engine.md section 4), computed once.
 //!
 //! Written from that page, independent of the engine's plan.
 
@@ -29,7 +29,7 @@ pub(super) struct Share {
     pub safe: Option<u8>,
 }
 
-/// A variable's owner and way up.
+/// The owner of a variable, and the route of its values to the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Owned {
     /// The port's index in the configuration.
@@ -40,7 +40,7 @@ pub(super) struct Owned {
     pub safe: Option<Raw>,
 }
 
-/// The source of a shown variable.
+/// The source of a variable that a port sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Origin {
     Field,
@@ -57,10 +57,10 @@ pub(super) struct PortSpec {
     pub mode: Mode,
     pub inputs: Vec<Frame>,
     pub outputs: Vec<Frame>,
-    /// The variables that the inputs write, and the byte variables among them.
+    /// The variables that the input frames write, and the byte variables among them.
     pub written: Vec<SysVar>,
     pub written_bits: Vec<SysVar>,
-    /// The variables that the outputs show, and that of the bit that triggers them.
+    /// The variables in the output frames, and the variable of the bit that triggers these frames.
     pub needed: Vec<SysVar>,
     pub timeout: Duration,
     pub stale_after: Duration,
@@ -69,16 +69,16 @@ pub(super) struct PortSpec {
     pub send: SendOn,
     pub idle_gap: Duration,
     pub turnaround: Duration,
-    /// What tells the frames of its input part apart.
+    /// How the frames of the input part are told apart.
     pub framing: Boundary,
-    /// What is asked of slaves or devices. The replies are behind the other inputs.
+    /// The exchanges with slaves or devices. Their replies come after the other input frames.
     pub exchanges: Option<ExchangesSpec>,
-    /// What a master on a Modbus line may ask. What it writes is behind the other inputs.
+    /// The blocks that a master on a Modbus line may access. The values it writes come after the other input frames.
     pub served: Option<ServedSpec>,
 }
 
 impl PortSpec {
-    /// The variables that its frames show, and its requests.
+    /// The variables in the port's output frames and requests.
     fn shown(&self) -> impl Iterator<Item = SysVar> {
         let fields = self.outputs.iter().flat_map(|frame| &frame.shown).copied();
         let rows = self.exchanges.iter().flat_map(|exchanges| &exchanges.rows);
@@ -94,10 +94,10 @@ pub(super) struct LinkSpec {
     pub is_datagram: bool,
     pub input: Option<Frame>,
     pub output: Option<Frame>,
-    /// Variables in its frames up are read back while their owners are overdue.
+    /// The variables that are sent in its frames are read back while their owners are overdue.
     pub reads_back: bool,
-    /// How long what is sent may be in flight. After that, unacknowledged data is given up with its
-    /// connection. Datagrams do not wait.
+    /// How long sent data may be in flight. Unacknowledged data is given up after that, with its connection. Datagrams
+    /// do not wait.
     pub not_after: Duration,
 }
 
@@ -109,9 +109,9 @@ pub(super) struct Spec {
     pub owned: [Option<Owned>; COUNT],
     pub origin: [Option<Origin>; COUNT],
     pub read_back: [bool; COUNT],
-    /// Variables that are taken from the state stream.
+    /// The variables that are taken from the state stream.
     pub in_packet: Vec<SysVar>,
-    /// Variables that have a safe value.
+    /// The variables that have a safe value.
     pub safe_vars: Vec<SysVar>,
     /// The gateway has a state link.
     pub has_state: bool,
@@ -121,7 +121,7 @@ pub(super) struct Spec {
     pub has_triggers: bool,
     /// The entries of all command tables.
     pub commands: Vec<Entry>,
-    /// The bits that ports drive one by one.
+    /// The bits that ports write one by one.
     pub shares: Vec<Share>,
 }
 
@@ -130,7 +130,7 @@ pub(super) struct Spec {
 pub(super) struct Entry {
     first: i64,
     last: i64,
-    /// Empty if the values pick nothing.
+    /// Empty if these values select no command.
     pub text: String,
 }
 
@@ -139,7 +139,7 @@ impl Entry {
         (self.first..=self.last).contains(&value)
     }
 
-    /// The command with the value in it.
+    /// The text of the command, with the value inserted.
     pub(super) fn text_for(&self, value: i64) -> String {
         self.text.replace("{value}", &value.to_string())
     }
@@ -210,7 +210,8 @@ impl Spec {
         }
     }
 
-    /// Checks that a write has all registers of each text that it has one of, and those that go with it.
+    /// Checks that a write is complete: if it has one register of a text, it needs all of them, and those that go with
+    /// them.
     pub(super) fn has_whole_texts(&self, values: &[(SysVar, Raw)]) -> Result<(), Wrong> {
         let has = |var: SysVar| values.iter().any(|(own, _)| *own == var);
         let fields = self.ports.iter().flat_map(|port| &port.inputs).flat_map(|frame| &frame.fields);
@@ -229,7 +230,7 @@ impl Spec {
         self.links.iter().find(|link| link.id == id)
     }
 
-    /// Whether anything shows the variable's value in the controller.
+    /// Whether the controller shows the value of the variable anywhere.
     pub(super) fn can_be_shown(&self, var: SysVar) -> bool {
         self.has_state && var.stream().is_some() || self.witness[var.ordinal()].is_some()
     }
@@ -261,7 +262,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
     let (mut exchanges, mut served) = (None, None);
     let (idle_gap, turnaround) = match port.bus {
         Bus::Rs485(line) => {
-            // 3.5 characters: a start bit, eight bits, parity, stop bits (D19).
+            // 3.5 characters, each with a start bit, eight bits, parity and stop bits (D19).
             let parity = u64::from(line.parity != proto_core::config::Parity::None);
             let half_bits = 7 * (9 + parity + u64::from(line.stop_bits));
             let characters = (half_bits * 1_000_000).div_ceil(2 * u64::from(line.baud));
@@ -310,7 +311,7 @@ fn port_spec(config: &GatewayConfig, port: &proto_core::config::Port) -> PortSpe
     }
 }
 
-/// The recipe links, that of the UDP server first.
+/// The recipe links; that of the UDP server comes first.
 fn links(config: &GatewayConfig) -> Vec<LinkSpec> {
     let mut links: Vec<LinkSpec> = Vec::new();
     if let Some(own) = config.controller.recipe_link {

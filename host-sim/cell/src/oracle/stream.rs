@@ -1,18 +1,18 @@
-//! The packets in the state stream (proto-core/docs/wire/state.md section 3, D8), judged by their decoded fields.
+//! The packets in the state stream (proto-core/docs/wire/state.md section 3, D8), checked by their decoded fields.
 
 use proto_core::wire::state::StatePacket;
 
-/// One connection's packets.
+/// The packets of one connection.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Stream {
-    /// The newest packet, and the newest one of a started controller.
+    /// The newest packet, and the newest one from a controller that has started.
     newest: Option<StatePacket>,
     started: Option<StatePacket>,
     wrong_in_a_row: u32,
 }
 
 impl Stream {
-    /// Whether this is the next packet. After three misaligned ones in a row, nothing is.
+    /// Whether these bytes are the next packet. After three misaligned packets in a row, no bytes are.
     pub(super) fn takes(&mut self, bytes: &[u8]) -> bool {
         let Ok(packet) = StatePacket::parse(bytes) else { return false };
         if self.wrong_in_a_row >= 3 || !is_packet(&packet) || self.is_elsewhere(&packet) {
@@ -27,7 +27,7 @@ impl Stream {
         true
     }
 
-    /// Whether the codes differ and the arm is more than 0.5 rad or m from where it was.
+    /// Whether the codes differ and the arm is more than 0.5 rad or m from its previous position.
     fn is_elsewhere(&self, packet: &StatePacket) -> bool {
         let (Some(started), Some(newest)) = (&self.started, &self.newest) else { return false };
         let tcp = if is_started(packet) { 0 } else { 3 };
@@ -114,8 +114,8 @@ mod tests {
 
     use super::*;
 
-    /// Compares the engine's check and this one, for a packet rotated by every number of bytes,
-    /// whole and with strange items.
+    /// Compares the engine's check with this one, for a packet rotated by every number of bytes, unchanged and with
+    /// implausible items.
     #[test]
     fn both_readings_agree() {
         let mut packet = StatePacket { robot_state: 6, safety_state: 5, ..StatePacket::ZERO };

@@ -12,7 +12,7 @@ use super::spec::exchanges::RowSpec;
 use super::spec::{LinkSpec, PortSpec, Share, Spec};
 use super::varying::can_be_the_same;
 
-/// Why a configuration cannot be judged, if it cannot.
+/// Why the model cannot judge a configuration; `None` if it can.
 pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
     if config.ports.iter().any(|port| port.bus.is_modbus_tcp()) {
         return Some("a soak cannot judge ports of Modbus TCP");
@@ -24,7 +24,7 @@ pub(crate) fn unmodelled(config: &GatewayConfig) -> Option<&'static str> {
     })
 }
 
-/// Why the blocks of a configuration cannot be judged, if they cannot.
+/// Why the model cannot judge the blocks of a configuration; `None` if it can.
 fn in_blocks(config: &GatewayConfig) -> Option<&'static str> {
     let served = config.exchanges.iter().filter_map(|exchange| match exchange.transaction {
         Transaction::Served { read, written, .. } => Some([read, written]),
@@ -54,7 +54,7 @@ fn in_blocks(config: &GatewayConfig) -> Option<&'static str> {
         .then_some("a soak cannot judge constants, digits and reply codes in the blocks of a slave")
 }
 
-/// Why the exchanges of a configuration cannot be judged, if they cannot.
+/// Why the model cannot judge the exchanges of a configuration; `None` if it can.
 fn in_exchanges(config: &GatewayConfig) -> Option<&'static str> {
     let serves = |port: &&Port| {
         let exchanges = config.view().exchanges_of(recipe_of(config.view(), port));
@@ -136,7 +136,7 @@ fn in_exchanges(config: &GatewayConfig) -> Option<&'static str> {
     None
 }
 
-/// Why the texts and frames of varying length of a configuration cannot be judged, if they cannot.
+/// Why the model cannot judge the texts and frames of varying length of a configuration; `None` if it can.
 fn in_varying_frames(config: &GatewayConfig) -> Option<&'static str> {
     let is_text = |field: &FieldSpec| {
         matches!(field, FieldSpec::TextInput { .. } | FieldSpec::TextOutput { .. }) || varies(field)
@@ -179,7 +179,7 @@ fn in_varying_frames(config: &GatewayConfig) -> Option<&'static str> {
     None
 }
 
-/// Why the requests that a configuration makes cannot be judged, if they cannot.
+/// Why the model cannot judge the requests of a configuration; `None` if it can.
 fn in_requests(ports: &[PortSpec]) -> Option<&'static str> {
     let is_twice = |port: &PortSpec| {
         let rows = port.exchanges.iter().flat_map(|exchanges| &exchanges.rows);
@@ -207,7 +207,7 @@ fn in_requests(ports: &[PortSpec]) -> Option<&'static str> {
     ports.iter().any(is_twice).then_some("a soak cannot judge two exchanges of a port with the same request")
 }
 
-/// Why the bits of a configuration cannot be judged, if they cannot.
+/// Why the model cannot judge the bits of a configuration; `None` if it can.
 fn in_bits(config: &GatewayConfig, spec: &Spec) -> Option<&'static str> {
     let carries = |link: &LinkSpec, var| link.input.as_ref().is_some_and(|up: &Frame| up.has(var));
     let is_odd = |share: &Share| {

@@ -159,8 +159,7 @@ impl Batch {
     }
 
     /// The names of the cells, each with a hash of its configuration and of the first moments of its first run. The
-    /// hashes
-    /// are equal on two machines that would run the batch in the same way.
+    /// hashes are equal on two machines that would run the batch in the same way.
     pub fn fingerprints(&self) -> Vec<(String, u64)> {
         let first_moments = |nth: usize, scenario: &Scenario| {
             let mut soak = Soak::new(scenario, self.seed_of(nth), self.level).ok()?;
@@ -191,8 +190,7 @@ impl Batch {
     }
 
     /// Executes runs until all are done, one fails, or [`Batch::stop`] is called. Several threads may call this at the
-    /// same
-    /// time.
+    /// same time.
     pub fn work(&self) {
         while !self.stop.load(Relaxed) {
             let run = self.next.fetch_add(1, Relaxed);

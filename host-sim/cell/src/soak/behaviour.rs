@@ -1,6 +1,5 @@
 //! The behaviour of a simulated device that answers requests. It changes every few seconds: prompt, slow, late,
-//! refusing,
-//! dead, or with damaged replies.
+//! refusing, dead, or with damaged replies.
 
 use proto_core::time::{Duration, Instant};
 

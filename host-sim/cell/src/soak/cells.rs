@@ -45,8 +45,7 @@ macro_rules! embedded {
 }
 
 /// A seed selects a cell by position, so the order must not change. If the controller of an example has field ports of
-/// its
-/// own, the controller is replaced, since no device would be connected to them.
+/// its own, the controller is replaced, since no device would be connected to them.
 const EMBEDDED: [Embedded; 22] = [
     embedded!("/../configs/", "rs485-system", "can-hand"),
     embedded!("/../configs/", "udp-server", "udp-server"),

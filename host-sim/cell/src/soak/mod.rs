@@ -1,10 +1,8 @@
 //! Soak runs: hours of cells in virtual time with random faults, where every step of the gateway is checked
-//! (docs/cell.md
-//! sections 4 and 5).
+//! (docs/cell.md sections 4 and 5).
 //!
 //! In: cells, a seed, a level of faults, virtual time. Out: a [`Total`], the same for the same seed on every machine
-//! and
-//! for any number of threads, or the first violation and how to repeat it. Does not know how results are printed:
+//! and for any number of threads, or the first violation and how to repeat it. Does not know how results are printed:
 //! `host-sim soak` does that.
 
 mod batch;
@@ -195,8 +193,7 @@ impl Soak {
     }
 
     /// Advances time until `elapsed` after the start, or until an invariant is violated. The result does not depend on
-    /// how the
-    /// time is split into calls.
+    /// how the time is split into calls.
     pub fn run_to(&mut self, elapsed: Duration) {
         let end = self.start + elapsed;
         while self.cell.violation().is_none() {

@@ -1,11 +1,9 @@
 //! Simulated devices with frames of their own that answer requests: all peers of a port in one device.
 //!
 //! In: the exchanges of a port and a seed. Out: replies, most of them right and in time, and unsolicited frames. Each
-//! peer
-//! changes its behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged, cut
-//! short, lost, behind noise, or to another request. No reply takes three times the timeout: after that, no master
-//! could
-//! tell it from a reply to the next request.
+//! peer changes its behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged,
+//! cut short, lost, behind noise, or to another request. No reply takes three times the timeout: after that, no master
+//! could tell it from a reply to the next request.
 
 use proto_core::config::{DeviceFrame, FieldSpec, GatewayConfig, OutputBinding, Parts, Port, Transaction};
 use proto_core::device::{Carrier, Probe};

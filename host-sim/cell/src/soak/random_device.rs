@@ -95,8 +95,7 @@ impl RandomDevice {
     }
 
     /// Advances to the next template, with new values, and sets the next deadline. Returns the index of the template;
-    /// `None`
-    /// if the device is silent.
+    /// `None` if the device is silent.
     fn step(&mut self, now: Instant) -> Option<usize> {
         if now >= self.behaviour_ends {
             self.change_behaviour(now);

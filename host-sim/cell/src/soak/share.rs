@@ -28,8 +28,7 @@ impl Share {
     }
 
     /// The runs of the share. They are contiguous, so each share with enough runs has all cells in turn. Empty only if
-    /// there
-    /// are fewer runs than shares.
+    /// there are fewer runs than shares.
     pub fn runs(self, all: usize) -> Range<usize> {
         let border = |nth: usize| (all as u128 * nth as u128 / self.of as u128) as usize;
         border(self.nth - 1)..border(self.nth)

@@ -1,12 +1,9 @@
 //! Simulated slaves of a Modbus RTU line: all slaves that a port polls, in one device.
 //!
 //! In: the exchanges of a port and a seed. Out: replies, most of them right and in time. Each slave changes its
-//! behaviour
-//! every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged, lost or under another
-//! slave's
-//! address. No reply takes three times the timeout: after that, no master could tell it from a reply to the next
-//! request
-//! (proto-core/docs/wire/modbus-rtu.md section 4).
+//! behaviour every few seconds: prompt, slow, late, refusing, dead, or with replies that are damaged, lost or under
+//! another slave's address. No reply takes three times the timeout: after that, no master could tell it from a reply to
+//! the next request (proto-core/docs/wire/modbus-rtu.md section 4).
 
 use std::collections::BTreeMap;
 

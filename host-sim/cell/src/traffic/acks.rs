@@ -9,8 +9,7 @@ use crate::tcp::{Retransmission, TCP_TIMEOUT, USER_TIMEOUT};
 
 impl Cell {
     /// The gateway's transport gives up a connection on which nothing was acknowledged for too long. The controller is
-    /// not
-    /// told.
+    /// not told.
     pub(crate) fn user_timeout(&mut self, id: u64) {
         let now = self.now;
         let Some(conn) = self.conns.get_mut(&id) else { return };

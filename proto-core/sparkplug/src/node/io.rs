@@ -16,8 +16,7 @@ pub enum Input<'a> {
     /// Bytes from the server.
     Bytes(&'a [u8]),
     /// All values at this instant, by their places in the catalog; `None`: unknown. Values missing at the end are
-    /// unknown
-    /// too.
+    /// unknown too.
     Sample {
         /// The values.
         values: &'a [Option<Value>],
