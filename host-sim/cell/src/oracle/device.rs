@@ -1,5 +1,5 @@
-//! Frames of devices: a plain implementation of docs/configuration.md section 4, for frames whose fields
-//! always have the same length. What varies is laid out by `varying.rs`.
+//! Frames of devices: a plain implementation of docs/configuration.md section 4 for frames of fixed length. Frames of
+//! varying length are laid out by `varying.rs`.
 //!
 //! Written from that page, independent of the engine's layouts and encodings.
 
@@ -12,34 +12,34 @@ use proto_core::wire::scalar::ScalarType;
 /// The places of a frame's fields.
 #[derive(Debug, Clone, Default)]
 pub(super) struct DeviceSpec {
-    /// Of each field, in the whole frame.
+    /// The place of each field in the whole frame.
     pub places: Vec<Range<usize>>,
     /// The checksum, its place, and the bytes that it covers.
     sum: Option<(Checksum, Range<usize>, Range<usize>)>,
-    /// Bytes of fields and checksum.
+    /// Number of bytes of the fields and the checksum.
     pub len: usize,
 }
 
-/// What bytes are, seen as a frame that begins with the first of them.
+/// How bytes are interpreted as a frame that begins with the first of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Look {
-    /// None begins here.
+    /// No frame begins here.
     No,
-    /// Perhaps one begins here; whether all constants so far are its own.
+    /// A frame may begin here. `is_ours`: all constants so far are those of this frame.
     Begins { is_ours: bool },
-    /// A frame of so many bytes.
+    /// A frame of this many bytes.
     Frame(usize),
-    /// One whose checksum is right, and of which a constant is another device's.
+    /// A frame with a valid checksum, of this many bytes, in which a constant is another device's.
     Other(usize),
-    /// One whose checksum is wrong.
+    /// A frame of this many bytes with an invalid checksum.
     Wrong(usize),
 }
 
-/// What a whole frame turns out to be.
+/// How a complete frame is interpreted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Seen {
     Ours,
-    /// The checksum is right, and a constant is another device's.
+    /// The checksum is valid, but a constant is another device's.
     Other,
     WrongChecksum,
     /// Not a frame.
@@ -59,7 +59,7 @@ impl DeviceSpec {
                 FieldSpec::Padding { len, .. } => (usize::from(*len), false),
                 FieldSpec::Checksum(sum) => (sum_bytes(sum), false),
                 FieldSpec::System(var) => (var.size(), false),
-                // Nothing of it is in the frame.
+                // These take no bytes of the frame.
                 FieldSpec::Limits(_) | FieldSpec::Mapped(_) | FieldSpec::InputRule(_) => (0, true),
                 FieldSpec::TextInput { text, .. } | FieldSpec::TextOutput { text, .. } => match text.width {
                     TextWidth::Fixed(width) => (usize::from(width), false),
@@ -81,12 +81,12 @@ impl DeviceSpec {
         spec
     }
 
-    /// Its checksum stands there and covers these bytes.
+    /// Sets the checksum, its place, and the bytes that it covers.
     pub(super) fn set_sum(&mut self, sum: Checksum, place: Range<usize>, covered: Range<usize>) {
         self.sum = Some((sum, place, covered));
     }
 
-    /// What a whole frame with the right head, tail and length is.
+    /// Interprets a complete frame with the right head, tail and length.
     pub(super) fn see(&self, fields: &[FieldSpec], frame: &[u8]) -> Seen {
         match (self.sum_is_right(frame), self.agrees(fields, frame)) {
             (None, false) => Seen::Nothing,
@@ -96,7 +96,7 @@ impl DeviceSpec {
         }
     }
 
-    /// Whether the constants that the bytes have completely are those of the frame.
+    /// Whether the constants that are completely in the bytes are those of the frame.
     pub(super) fn agrees(&self, fields: &[FieldSpec], bytes: &[u8]) -> bool {
         fields.iter().zip(&self.places).filter(|(_, place)| place.end <= bytes.len()).all(|(field, place)| {
             constant(field)
@@ -104,7 +104,7 @@ impl DeviceSpec {
         })
     }
 
-    /// `None` without a checksum.
+    /// Whether the checksum is valid; `None` without a checksum.
     pub(super) fn sum_is_right(&self, frame: &[u8]) -> Option<bool> {
         let (sum, place, covered) = self.sum.as_ref()?;
         let (id, covered) = (sum.data_id.bytes(), &frame[covered.clone()]);
@@ -126,12 +126,12 @@ impl DeviceSpec {
     }
 }
 
-/// How many bytes a field has.
+/// The number of bytes of a field.
 pub(super) enum Size {
     Fixed(usize),
-    /// Up to this byte, which stands behind it, and at most so many.
+    /// Up to this delimiter after the field, and at most this many bytes.
     Until(u8, usize),
-    /// All that the others leave.
+    /// All bytes that the other fields leave.
     Rest,
 }
 
@@ -166,12 +166,12 @@ fn of_width(width: Width) -> Size {
     }
 }
 
-/// Whether a field has not the same length in every frame, or says how long the frame is.
+/// Whether the length of a field varies from frame to frame, or the field contains the length of the frame.
 pub(super) fn varies(field: &FieldSpec) -> bool {
     matches!(field, FieldSpec::Length(_)) || !matches!(size(field), Size::Fixed(_))
 }
 
-/// The encoding and the number of a field that is the same in every frame.
+/// The encoding and the number of a constant field.
 pub(super) fn constant(field: &FieldSpec) -> Option<(Encoding, f64)> {
     let (encoding, overflow, number) = match *field {
         FieldSpec::Fixed { encoding, value } => return Some((encoding, value as f64)),
@@ -208,7 +208,7 @@ fn checksum(algorithm: &Algorithm, bytes: impl Iterator<Item = u8> + Clone) -> u
     }
 }
 
-/// The remainder, a bit at a time.
+/// The remainder, computed bit by bit.
 fn crc_of(crc: &Crc, bytes: impl Iterator<Item = u8>) -> u32 {
     let width = u32::from(crc.width);
     let top = 1_u64 << width;
@@ -228,12 +228,12 @@ fn crc_of(crc: &Crc, bytes: impl Iterator<Item = u8>) -> u32 {
     result ^ crc.xorout
 }
 
-/// The number that a field sends for one of its source, by what stands behind the field; `None` if nothing is sent.
+/// The number that a field sends for a number of its source, by the rules after the field; `None` if nothing is sent.
 pub(super) fn sent_for(encoding: &Encoding, number: f64, behind: &[FieldSpec]) -> Option<f64> {
     let is_whole = encoding.is_integer();
     match behind.first() {
         Some(FieldSpec::Limits(Limits { low, high, outside })) => {
-            // Compared as the field shows it, which a float does to seven digits.
+            // Compared as the field sends it: a float has seven digits.
             let shown = if is_whole { number.round() } else { f64::from(number as f32) };
             let ends = [*low, *high].map(|end| if is_whole { end } else { f64::from(end as f32) });
             let is_outside = shown < ends[0] || shown > ends[1];
@@ -250,16 +250,16 @@ pub(super) fn sent_for(encoding: &Encoding, number: f64, behind: &[FieldSpec]) -
     }
 }
 
-/// What is read from an input field.
+/// The value read from an input field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Read {
     Number(f64),
     Unreadable,
-    /// The device says that it has none.
+    /// The device reports that it has no value.
     NoValue,
 }
 
-/// The number of an input field, by what stands behind it.
+/// The number of an input field, by the rules after the field.
 pub(super) fn read_ruled(encoding: &Encoding, bytes: &[u8], behind: &[FieldSpec]) -> Read {
     let rules = || {
         behind
@@ -288,7 +288,7 @@ pub(super) fn read_ruled(encoding: &Encoding, bytes: &[u8], behind: &[FieldSpec]
     }
 }
 
-/// What a variable becomes for the number of its field, before it is rounded; `None` if the number is not allowed.
+/// The value of a variable for the number of its field, before rounding; `None` if the number is not allowed.
 pub(super) fn taken_for(
     encoding: &Encoding,
     number: f64,
@@ -312,7 +312,7 @@ pub(super) fn taken_for(
     for field in behind {
         let FieldSpec::Limits(Limits { low, high, outside }) = *field else { continue };
         let is_single = !encoding.is_integer() || matches!(encoding.kind, Kind::Decimal(_));
-        // As a float shows it, unless it is an integer.
+        // Numbers are used as a float represents them, unless they are integers.
         let of = |number: f64| if is_single { f64::from(number as f32) } else { number };
         if (of(number) < of(low) || of(number) > of(high)) && outside == Outside::Refuse {
             return None;
@@ -322,7 +322,7 @@ pub(super) fn taken_for(
     Some(number * f64::from(scale) + f64::from(offset))
 }
 
-/// What stands behind a field.
+/// The rules after a field.
 pub(super) fn behind(fields: &[FieldSpec], nth: usize) -> &[FieldSpec] {
     let rest = &fields[nth + 1..];
     let len = rest.iter().take_while(|field| field.is_of_field_before()).count();
@@ -349,12 +349,12 @@ fn fixed(width: Width) -> usize {
     }
 }
 
-/// The place of the `nth` byte from the highest on, of so many.
+/// The place of the `nth` byte, counted from the highest, in a number of `len` bytes.
 fn place_of(order: ByteOrder, nth: usize, len: usize) -> usize {
     match order {
         ByteOrder::Big => nth,
         ByteOrder::Little => len - 1 - nth,
-        // Pairs from the last one on; of an odd number, the last byte is alone.
+        // Pairs of bytes, the last pair first; if the number of bytes is odd, the last byte is alone.
         ByteOrder::BigSwapped => match nth.checked_sub(len % 2) {
             Some(nth) => len - len % 2 - 2 - nth / 2 * 2 + nth % 2,
             None => len - 1,
@@ -364,17 +364,17 @@ fn place_of(order: ByteOrder, nth: usize, len: usize) -> usize {
     }
 }
 
-/// The bytes with the highest first.
+/// The bytes, the highest first.
 fn ordered(order: ByteOrder, bytes: &[u8]) -> impl Iterator<Item = u8> {
     (0..bytes.len()).map(move |nth| bytes[place_of(order, nth, bytes.len())])
 }
 
-/// The unsigned number that the bytes are.
+/// The unsigned number in the bytes.
 fn unsigned(order: ByteOrder, bytes: &[u8]) -> u64 {
     ordered(order, bytes).fold(0, |number, byte| number << 8 | u64::from(byte))
 }
 
-/// The number of a field's bytes; `None` if it is not readable.
+/// The number in a field's bytes; `None` if it is unreadable.
 pub(super) fn read(encoding: &Encoding, bytes: &[u8]) -> Option<f64> {
     let unsigned = unsigned(encoding.order, bytes);
     let signed = |number: u64, bits: u32| (number << (64 - bits)).cast_signed() >> (64 - bits);
@@ -421,12 +421,12 @@ pub(super) fn read(encoding: &Encoding, bytes: &[u8]) -> Option<f64> {
     })
 }
 
-/// Whether [`write`] knows how such a field is written.
+/// Whether [`write`] supports fields with this encoding.
 pub(super) const fn is_written_by_model(encoding: &Encoding) -> bool {
     matches!(encoding.kind, Kind::Scalar(_) | Kind::Uint24 | Kind::Int24 | Kind::Bits(_))
 }
 
-/// Writes a number that the field can have into its bytes; other bits of the same bytes stay.
+/// Writes a number that the field can represent into its bytes. Other bits of these bytes are unchanged.
 pub(super) fn write(encoding: &Encoding, number: f64, bytes: &mut [u8]) {
     let len = bytes.len();
     let number = match encoding.kind {
@@ -443,7 +443,7 @@ pub(super) fn write(encoding: &Encoding, number: f64, bytes: &mut [u8]) {
     }
 }
 
-/// The number that a field shows for `number`: rounded, and the nearest that it can have or wrapped.
+/// The number that a field sends for `number`: rounded, then limited to the field's range, or wrapped.
 pub(super) fn shown_as(encoding: &Encoding, overflow: Overflow, number: f64) -> f64 {
     let (low, high) = range(encoding);
     let is_float = matches!(encoding.kind, Kind::Scalar(ScalarType::Float | ScalarType::Double));

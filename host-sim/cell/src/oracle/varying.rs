@@ -1,8 +1,8 @@
-//! What bytes are, seen as a frame; frames of varying length and the texts in them: docs/configuration.md section 4,
-//! "Frames of varying length".
+//! Frames of varying length and the texts in them, and how bytes are interpreted as a frame: docs/configuration.md
+//! section 4, "Frames of varying length".
 //!
-//! Written from that page, independent of the engine's layouts and cutters. In: a frame and bytes. Out: the
-//! places of the fields in these bytes, as of a frame whose fields always have the same length.
+//! Written from that page, independent of the engine's layouts and cutters. In: a frame and bytes. Out: the places of
+//! the fields in these bytes, in the form used for frames of fixed length.
 
 use std::ops::Range;
 
@@ -13,12 +13,12 @@ use proto_core::sysvar::SysVar;
 use super::device::{DeviceSpec, Look, MAX_TEXT, Seen, Size, constant, read, size};
 use super::frame::{Frame, Raw};
 
-/// Why whole bytes are no frame.
+/// Why bytes are not this frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Unlike {
-    /// No frame has this length, or the bytes end before a field does.
+    /// No frame has this length, or the bytes end inside a field.
     Length,
-    /// Something else in them is another frame's.
+    /// A constant in the bytes belongs to another frame.
     Content,
 }
 
@@ -27,7 +27,7 @@ fn is_shared(field: &FieldSpec) -> bool {
         || field.element().and_then(|element| element.encoding()).is_some_and(|encoding| encoding.shared)
 }
 
-/// Bytes of the shortest and of the longest frame.
+/// The lengths of the shortest and of the longest frame in bytes.
 pub(super) fn lengths(frame: &Frame) -> (usize, usize) {
     let delimiters = frame.head.len() + frame.tail.len();
     frame.fields.iter().filter(|field| !is_shared(field)).fold(
@@ -40,7 +40,7 @@ pub(super) fn lengths(frame: &Frame) -> (usize, usize) {
     )
 }
 
-/// The places of the fields in `whole`, which is one frame from its first byte to its last.
+/// The places of the fields in `whole`, which is exactly one frame.
 pub(super) fn lay_out(frame: &Frame, whole: &[u8]) -> Result<DeviceSpec, Unlike> {
     let (shortest, longest) = lengths(frame);
     if !(shortest..=longest).contains(&whole.len()) {
@@ -107,27 +107,27 @@ fn fixed_size(field: &FieldSpec) -> usize {
     }
 }
 
-/// What a length that ends at `at` counts in a frame of `len` bytes.
+/// What a length field that ends at `at` contains in a frame of `len` bytes.
 fn counted(frame: &Frame, counts: Counts, at: usize, len: usize) -> i64 {
     let sum = frame.fields.iter().rev().find(|field| matches!(field, FieldSpec::Checksum(_)));
     let others = frame.tail.len() + sum.map_or(0, fixed_size);
     let counted = match counts {
         Counts::Rest => len - at,
         Counts::Frame => len,
-        // A soak refuses such a length behind a checksum.
+        // A soak run refuses such a length after a checksum.
         Counts::Fields => len.saturating_sub(at + others),
     };
     counted as i64
 }
 
-/// What a whole frame is.
+/// Interprets a complete frame.
 pub(super) fn see(frame: &Frame, whole: &[u8]) -> Result<(DeviceSpec, Seen), Unlike> {
     let spec = lay_out(frame, whole)?;
     let seen = spec.see(&frame.fields, whole);
     Ok((spec, seen))
 }
 
-/// What bytes of a line are, seen as this frame.
+/// Interprets bytes of a line as this frame.
 pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
     if frame.varies {
         return look_varying(frame, bytes);
@@ -151,7 +151,7 @@ pub(super) fn look(frame: &Frame, bytes: &[u8]) -> Look {
     }
 }
 
-/// Whether two frames of the same direction can have the same bytes, so that nobody could tell them apart.
+/// Whether two frames of the same direction can have the same bytes, so that they cannot be told apart.
 pub(super) fn can_be_the_same(one: &Frame, other: &Frame) -> bool {
     let (Some(of_one), Some(of_other)) = (&one.device, &other.device) else { return false };
     let constants = |frame: &'_ Frame, device: &'_ DeviceSpec| -> Vec<(Range<usize>, Encoding, u64)> {
@@ -168,7 +168,7 @@ pub(super) fn can_be_the_same(one: &Frame, other: &Frame) -> bool {
     (one.id, &one.head, &one.tail, one.len()) == (other.id, &other.head, &other.tail, other.len()) && !differ
 }
 
-/// What bytes of a line are, seen as such a frame that is searched: its length stands in front of what varies.
+/// Interprets bytes of a line as a frame of varying length that has its length field before the varying part.
 fn look_varying(frame: &Frame, bytes: &[u8]) -> Look {
     let seen = bytes.len().min(frame.head.len());
     let (shortest, longest) = lengths(frame);
@@ -204,14 +204,14 @@ fn look_varying(frame: &Frame, bytes: &[u8]) -> Look {
     }
 }
 
-/// The text that the bytes of a field are: without what fills it up.
+/// The text in the bytes of a field, without padding.
 pub(super) fn text_in(text: Text, bytes: &[u8]) -> &[u8] {
     let (TextWidth::Fixed(_), Some(fill)) = (text.width, text.fill) else { return bytes };
     let len = bytes.iter().rposition(|&byte| byte != fill).map_or(0, |last| last + 1);
     &bytes[..len]
 }
 
-/// The registers that have a text, two characters each, zeros behind its end; `None` if it is too long.
+/// The registers with a text: two characters each, and zeros after its end. `None` if the text is too long.
 pub(super) fn registers(words: Words, text: &[u8]) -> Option<Vec<(SysVar, Raw)>> {
     if text.len() > 2 * usize::from(words.count) {
         return None;
@@ -225,7 +225,8 @@ pub(super) fn registers(words: Words, text: &[u8]) -> Option<Vec<(SysVar, Raw)>>
     Some(vars.collect())
 }
 
-/// The text that registers have: up to the first zero, or of so many characters; `None` if there is no room for these.
+/// The text in registers: up to the first zero, or with a given number of characters. `None` if that number does not
+/// fit.
 pub(super) fn text_of(
     words: Words,
     raw: impl Fn(SysVar) -> Option<Raw>,

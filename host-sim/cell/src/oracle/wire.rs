@@ -1,5 +1,5 @@
-//! Traffic between the gateway and the controller: an independent reading of Modbus
-//! (proto-core/docs/wire/modbus.md), and whether the data that arrives is the data sent.
+//! Traffic between the gateway and the controller: an independent parser of Modbus (proto-core/docs/wire/modbus.md),
+//! and checks that the data that arrives is the data that was sent.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -12,7 +12,7 @@ use super::frame::Raw;
 use super::invariant::Wrong;
 use super::spec::Spec;
 
-/// A request without an answer is given up after this.
+/// A request without a reply is given up after this time.
 const ANSWER: Duration = Duration::from_millis(500);
 
 /// The content of a request.
@@ -31,11 +31,11 @@ struct Reads {
     count: u16,
 }
 
-/// What a write has of safe values.
+/// The safe values in a write.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Safe {
     pub vars: Vec<SysVar>,
-    /// Shares, and bits of them.
+    /// Bits as pairs: the share, and the bit in it.
     pub bits: Vec<(usize, u8)>,
 }
 
@@ -53,7 +53,7 @@ impl Safe {
 /// The one transaction in flight.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Modbus {
-    /// Its number, what it reads, and when it was sent.
+    /// The transaction id, what is read, and when the request was sent.
     in_flight: Option<([u8; 2], Option<Reads>, Instant)>,
     /// The safe values in the write in flight.
     safe: Safe,
@@ -65,7 +65,7 @@ impl Modbus {
         self.in_flight.is_none()
     }
 
-    /// Gives up a request that was not answered in time; returns its safe values.
+    /// Gives up a request that was not answered in time; returns the safe values in it.
     pub(super) fn tick(&mut self, now: Instant) -> Safe {
         if self.in_flight.as_ref().is_none_or(|asked| now < asked.2 + ANSWER) {
             return Safe::default();
@@ -101,7 +101,8 @@ impl Modbus {
         Ok(asked)
     }
 
-    /// Handles the controller's bytes; `read` gets the values read. Returns the safe values refused.
+    /// Handles bytes from the controller; `read` gets the values that were read. Returns the safe values that were
+    /// refused.
     pub(super) fn received(&mut self, map: &Map, bytes: &[u8], mut read: impl FnMut(SysVar, Raw)) -> Safe {
         self.held.extend_from_slice(bytes);
         let (mut at, mut refused) = (0, Safe::default());
@@ -128,7 +129,7 @@ impl Modbus {
     }
 }
 
-/// The length of the first whole frame.
+/// The length of the first complete frame.
 fn frame_len(bytes: &[u8]) -> Option<usize> {
     let len = 6 + usize::from(u16::from_be_bytes([*bytes.get(4)?, *bytes.get(5)?]));
     (bytes.len() >= len).then_some(len)
@@ -140,7 +141,7 @@ pub(super) struct Map {
     coils: Vec<Option<SysVar>>,
     inputs: [Option<SysVar>; 512],
     words: Vec<Option<SysVar>>,
-    /// Bytes of whose bits each has its owner.
+    /// Bytes whose bits have separate owners.
     shared: Vec<SysVar>,
 }
 
@@ -165,8 +166,8 @@ impl Map {
         map
     }
 
-    /// Parses a request; `None` if it is not one of the four that a gateway sends, or does not write whole
-    /// variables or bits with owners.
+    /// Parses a request. `None` if it is not one of the four that a gateway sends, or does not write whole variables or
+    /// bits with owners.
     pub(super) fn request(&self, pdu: &[u8]) -> Option<Asked> {
         let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
         let (first, count) = (word(1)?, word(3)?);
@@ -209,7 +210,7 @@ impl Map {
         }
     }
 
-    /// The bits of a byte of whose bits each has its owner.
+    /// The bits of a byte whose bits have separate owners.
     fn bits(&self, first: u16, count: u16, packed: &[u8]) -> Option<Coils> {
         self.shared.iter().find_map(|&var| {
             let Some(ModbusPlace::Coils { first: start, count: all }) = var.modbus() else { return None };
@@ -219,7 +220,7 @@ impl Map {
         })
     }
 
-    /// The variables that are completely in the range that was read.
+    /// Calls `found` with each variable that is completely in the range that was read.
     fn read(&self, reads: Reads, data: &[u8], mut found: impl FnMut(SysVar, Raw)) {
         let Reads { coils, first, count } = reads;
         for address in first..first.saturating_add(count) {
@@ -248,7 +249,7 @@ impl Map {
     }
 }
 
-/// Data that was sent and has not arrived yet, and partial frames at the controller.
+/// Sent data that has not arrived yet, and partial frames at the controller.
 #[derive(Debug, Clone)]
 pub(super) struct Controller {
     sent: BTreeMap<u64, VecDeque<u8>>,
@@ -316,7 +317,7 @@ impl Controller {
         held.drain(..at);
     }
 
-    /// Received bytes of a recipe connection; the caller finds the frames.
+    /// The received bytes of a recipe connection, in which the caller finds the frames.
     pub(super) fn held(&mut self, conn: u64) -> &mut Vec<u8> {
         self.held.entry(conn).or_default()
     }
@@ -332,7 +333,7 @@ pub(crate) fn inputs_of(image: &[u8]) -> &[u8] {
     &image[..INPUT_BYTES]
 }
 
-/// The same, copied before they change.
+/// A copy of the input variables in the controller's image.
 pub(crate) fn copied_inputs(image: &[u8]) -> Inputs {
     let mut inputs = [0; INPUT_BYTES];
     inputs.copy_from_slice(inputs_of(image));

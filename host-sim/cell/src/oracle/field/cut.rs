@@ -1,5 +1,5 @@
-//! Frames that end with a tail, or with silence: what cuts them (docs/configuration.md section 4, "Frames of varying
-//! length").
+//! Frames that end with a tail, or with silence: how received bytes are cut into frames (docs/configuration.md section
+//! 4, "Frames of varying length").
 //!
 //! Written from that page, independent of the engine's cutters.
 
@@ -10,27 +10,27 @@ use crate::oracle::device::Seen;
 use crate::oracle::spec::PortSpec;
 use crate::oracle::varying::{Unlike, see};
 
-/// What came between two ends.
+/// The bytes between two ends of frames.
 pub(in crate::oracle) enum Piece {
     Whole(Vec<u8>),
     TooLong,
-    /// Its beginning is missing.
+    /// The beginning of the frame is missing.
     Cut,
 }
 
 /// Frames that end with a tail, or with silence.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::oracle) struct CutWatch {
-    /// Bytes before those that are held are missing.
+    /// Bytes before the held ones are missing.
     is_cut: bool,
-    /// Bytes of a tail whose beginning may have been discarded: the newest eight.
+    /// The newest eight bytes, because the beginning of a tail may have been discarded.
     before: [u8; 8],
     before_len: usize,
 }
 
 impl LineWatch {
-    /// Bytes came on a line whose frames are cut; `late` says that there may have been silence before them.
-    /// Returns what has ended.
+    /// Handles received bytes of a line whose frames are cut; `late`: there may have been silence before them. Returns
+    /// the frames that have ended.
     pub(in crate::oracle) fn cut_bytes(
         &mut self,
         cut: Boundary,
@@ -56,12 +56,12 @@ impl LineWatch {
         [before, &self.held[..]].concat().ends_with(tail)
     }
 
-    /// Whether silence has something to end.
+    /// Whether silence would end a frame.
     pub(in crate::oracle) fn cut_has_begun(&self, cut: Boundary) -> bool {
         !self.held.is_empty() || cut == Boundary::Silence && self.cut.is_cut
     }
 
-    /// What is held has ended.
+    /// The held bytes have ended.
     pub(in crate::oracle) fn cut_piece(&mut self) -> Piece {
         let was_cut = std::mem::take(&mut self.cut).is_cut;
         let bytes = std::mem::take(&mut self.held);
@@ -74,7 +74,7 @@ impl LineWatch {
         if bytes.len() > LONGEST { Piece::TooLong } else { Piece::Whole(bytes) }
     }
 
-    /// Silence, or bytes are missing: what comes up to the next end is dropped with what is held.
+    /// There was silence, or bytes are missing: everything up to the next end is dropped, including the held bytes.
     pub(in crate::oracle) fn cut_off(&mut self) {
         let newest = self.held.iter().rev().take(8).rev().copied();
         let before = self.cut.before[..self.cut.before_len].iter().copied();
@@ -90,7 +90,7 @@ impl LineWatch {
 }
 
 impl LineWatch {
-    /// These bytes are lost: what they began cannot be trusted.
+    /// These bytes are lost, so the frame that they began cannot be trusted.
     pub(in crate::oracle) fn lose(&mut self, port: &PortSpec, bytes: &[u8]) {
         let Some(frame) = port.inputs.first().filter(|_| port.framing != Boundary::Fields) else { return };
         let counted = (self.discarded, self.frame_bytes);
@@ -99,7 +99,7 @@ impl LineWatch {
         (self.discarded, self.frame_bytes) = counted;
     }
 
-    /// What came between two ends is a frame as a whole, or rejected as a whole.
+    /// The bytes between two ends are accepted or rejected as one frame.
     pub(in crate::oracle) fn judge_piece(&mut self, port: &PortSpec, piece: &Piece) -> Option<Verdict> {
         let whole = match piece {
             Piece::Whole(whole) => whole,
@@ -116,5 +116,5 @@ impl LineWatch {
     }
 }
 
-/// No frame is longer.
+/// The longest frame in bytes.
 const LONGEST: usize = 512;

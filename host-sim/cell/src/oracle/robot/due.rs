@@ -138,7 +138,7 @@ impl Oracle {
     }
 }
 
-/// Notes since when a condition has held.
+/// Records since when a condition has held.
 fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: Instant) {
     if is_so {
         since.entry(link).or_insert(now);
@@ -147,7 +147,7 @@ fn note(since: &mut BTreeMap<LinkId, Instant>, link: LinkId, is_so: bool, now: I
     }
 }
 
-/// An urgent command arrives within this time after it is requested and a path works.
+/// An urgent command arrives within this time once it is requested and a path works.
 const STOP_ARRIVES: Duration = Duration::from_millis(1_500);
-/// A safe value arrives within this time after its owner is overdue and all paths work.
+/// A safe value arrives within this time once its owner is overdue and all paths work.
 pub(super) const SAFE_ARRIVES: Duration = Duration::from_millis(1_500);

@@ -1,8 +1,8 @@
-//! The robot's side: the age of each value and command when the controller receives it, and whether what
-//! must arrive does (docs/cell.md section 4).
+//! The robot's side: the age of each value and command when the controller receives it, and whether everything that
+//! must arrive does arrive (docs/cell.md section 4).
 //!
-//! In: the content of each transmission, when it arrives, and which paths to the controller work.
-//! Does not know what the engine considers delivered.
+//! In: the content of each transmission, when it arrives, and which paths to the controller work. Out: violations. Does
+//! not know what the engine considers delivered.
 
 mod due;
 
@@ -24,15 +24,15 @@ use super::{Invariant, Oracle};
 use crate::network::Sender;
 use crate::tcp::USER_TIMEOUT;
 
-/// The present state of one path to the controller.
+/// The current state of one path to the controller.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Path {
     pub link: LinkId,
-    /// The connection; `None` if there is none or the link has none.
+    /// The connection; `None` if there is none, or the link uses datagrams.
     pub conn: Option<u64>,
-    /// Data that is sent on it arrives.
+    /// Sent data arrives.
     pub is_sound: bool,
-    /// The server there executes and answers requests.
+    /// The server executes requests and replies.
     pub is_served: bool,
 }
 
@@ -40,9 +40,9 @@ pub(crate) struct Path {
 #[derive(Debug, Clone)]
 struct Transmission {
     sent_at: Instant,
-    /// Offset of its end in the connection's bytes.
+    /// Offset of the end of the transmission in the connection's bytes.
     end: u64,
-    /// Maximum time in flight, without the network's delay.
+    /// Maximum time in flight, not counting the delay of the network.
     not_after: Duration,
     slowest: Duration,
     values: Vec<(SysVar, Raw, Carried)>,
@@ -62,7 +62,7 @@ struct InFlightCommand {
 struct StopRequest {
     command: Command,
     has_arrived: bool,
-    /// Until then it may wait behind one like it.
+    /// Until then it may wait behind an equal command.
     not_before: Instant,
 }
 
@@ -77,7 +77,7 @@ struct InFlight {
 /// Transmissions in flight, and what must be at the controller.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Robot {
-    /// Content of the transmission that the engine is handing over.
+    /// Content of the transmission that the engine is sending.
     values: Vec<(SysVar, Raw, Carried)>,
     command: Option<InFlightCommand>,
     /// Buffers for values, reused.
@@ -94,13 +94,13 @@ pub(super) struct Robot {
     served: BTreeMap<LinkId, Instant>,
     conns: BTreeMap<LinkId, Option<u64>>,
     all_sound_since: Option<Instant>,
-    /// When the controller last restarted.
+    /// When the controller was last restarted.
     started_at: Option<Instant>,
     /// Since when the frames of each recipe link could be sent.
     ready: BTreeMap<LinkId, Instant>,
     /// Beginning and end of the gateway's stalls.
     stalls: VecDeque<(Instant, Instant)>,
-    /// The controller's inputs after the newest arrival, and when another program changed which byte.
+    /// The controller's inputs after the newest arrival, and when another program changed each byte.
     inputs: Vec<u8>,
     foreign_writes: BTreeMap<usize, Instant>,
     /// The sender of the newest frame to each port where the gateway listens.
@@ -121,7 +121,7 @@ impl Robot {
         self.command = Some(InFlightCommand { command, unasked: None });
     }
 
-    /// Devices request to stop the robot.
+    /// Devices request that the robot stops.
     pub(super) fn asked(&mut self, commands: Vec<Command>, waits_until: impl Fn(&Command) -> Instant) {
         for command in commands {
             self.stop_requests.retain(|request| {
@@ -132,7 +132,7 @@ impl Robot {
         }
     }
 
-    /// Commands that are no longer requested need not arrive, and after a while must not.
+    /// Commands that are no longer requested need not arrive. After a while they must not arrive any more.
     pub(super) fn no_longer_asked(&mut self, is_asked: impl Fn(&Command) -> bool, now: Instant) {
         self.stop_requests.retain(|request| is_asked(&request.command));
         let transmissions = self.in_flight.values_mut().flat_map(|in_flight| &mut in_flight.transmissions);
@@ -154,7 +154,7 @@ impl Robot {
         self.reset_soundness(now);
     }
 
-    /// No path has worked for longer than since now.
+    /// Counts all paths as working since now only.
     fn reset_soundness(&mut self, now: Instant) {
         self.sound.values_mut().chain(self.served.values_mut()).for_each(|since| *since = now);
     }
@@ -175,7 +175,7 @@ impl Robot {
         self.stalls.back().is_some_and(|(_, to)| *to == now)
     }
 
-    /// Whether the gateway is not called at present.
+    /// Whether the gateway is not called at the moment.
     pub(super) fn is_stalled(&self, now: Instant) -> bool {
         self.stalls.back().is_some_and(|(from, to)| *from <= now && now <= *to)
     }
@@ -247,8 +247,8 @@ impl Robot {
         Ok(())
     }
 
-    /// Compares the controller's inputs before an arrival with those after the previous one: other programs
-    /// made the changes.
+    /// Compares the controller's inputs before an arrival with those after the previous one. Differences are writes of
+    /// other programs.
     fn find_foreign_writes(&mut self, before: &[u8], now: Instant) {
         if self.inputs == before {
             return;
@@ -277,7 +277,7 @@ impl Robot {
 }
 
 impl Oracle {
-    /// The gateway hands bytes over to a connection.
+    /// The gateway sends bytes on a connection.
     pub(crate) fn sent(&mut self, conn: u64, link: LinkId, bytes: &[u8], slowest: Duration, now: Instant) {
         self.controller.sent(conn, bytes);
         let mut transmission = self.robot.transmission(&self.spec, link, slowest, now);
@@ -287,7 +287,7 @@ impl Oracle {
         in_flight.transmissions.push_back(transmission);
     }
 
-    /// Same, for a datagram; returns its number.
+    /// As [`Self::sent`], for a datagram; returns its number.
     pub(crate) fn sent_datagram(
         &mut self,
         link: LinkId,
@@ -310,7 +310,7 @@ impl Oracle {
     pub(crate) fn not_understood(&mut self, link: LinkId, now: Instant) {
         let quiet = self.robot.sound.get(&link).map(|since| now.saturating_since(*since));
         let result = match quiet {
-            // After a delay, texts without terminators may have been joined.
+            // After a delay, texts without terminators may have been received as one.
             Some(quiet) if quiet > Duration::from_secs(1) => {
                 Err((Invariant::Understood, "the controller did not understand a command".to_owned()))
             }
@@ -358,7 +358,7 @@ impl Oracle {
         self.judge(now, &[], result);
     }
 
-    /// Checks that the slaves of a line have held the values of a transmission that arrives.
+    /// Checks that the slaves of a line held the values of an arriving transmission.
     fn were_held(
         &mut self,
         transmission: &Transmission,
@@ -372,12 +372,12 @@ impl Oracle {
                 continue;
             };
             let Some(exchanges) = &self.spec.ports[owned.port].exchanges else { continue };
-            // Nobody tells what the frames of the input part beside the exchanges had.
+            // Nothing records the contents of input frames that belong to no exchange.
             let Some(row) = exchanges.rows.iter().find(|row| row.reply == Some(owned.frame)) else {
                 continue;
             };
             self.checks[Invariant::Held as usize] += 1;
-            // A reply was made at most so long before it is taken.
+            // A reply was made at most this long before it is accepted.
             let asked = row.timeout.saturating_mul(u64::from(row.retries) + 3);
             let stalled = self.robot.stalled_since(now - timeout, now);
             let since = now - (timeout + way + asked + stalled);
@@ -410,7 +410,7 @@ impl Oracle {
     pub(crate) fn stalled(&mut self, until: Instant, now: Instant) {
         let stalls = &mut self.robot.stalls;
         stalls.retain(|(_, to)| now.saturating_since(*to) < REMEMBERED);
-        // A prolonged stall is one stall.
+        // A prolonged stall counts as one stall.
         match stalls.back_mut() {
             Some((_, to)) if *to >= now => *to = until,
             _ => stalls.push_back((now, until)),
@@ -426,7 +426,7 @@ impl Oracle {
         }
     }
 
-    /// The link restarts: the gateway may answer any first sender.
+    /// The link restarts: the gateway may answer whoever sends first.
     pub(super) fn forget_sender(&mut self, link: LinkId) {
         self.robot.senders.remove(&link);
     }
@@ -449,13 +449,13 @@ fn not_after(spec: &Spec, link: LinkId) -> Duration {
     spec.link(link).map_or(Duration::from_millis(500), |link| link.not_after)
 }
 
-/// A command arrives within this time after it was picked.
+/// A command arrives within this time after it was selected.
 const COMMAND_TTL: Duration = Duration::from_secs(1);
-/// An urgent command is sent within 1 s after the device last requested it, and acknowledged within another.
+/// An urgent command is sent within 1 s after the device last requested it, and acknowledged within another second.
 const URGENT_TTL: Duration = Duration::from_secs(2);
 /// Parts of a transmission that is split into segments arrive at least a microsecond apart.
 const ALLOWANCE: Duration = Duration::from_millis(2);
 /// Maximum number of datagrams that may still arrive.
 const DATAGRAMS: usize = 4_096;
-/// For how long a stall is remembered.
+/// How long a stall is remembered.
 const REMEMBERED: Duration = Duration::from_secs(60);
