@@ -36,8 +36,7 @@ impl HeadBuffer {
 
 impl<'b> HeadBuffer<&'b mut [u8]> {
     /// An empty buffer in memory of the caller. With less than [`MAX_HEAD`] bytes, a head that does not fit never
-    /// becomes
-    /// complete.
+    /// becomes complete.
     pub const fn within(bytes: &'b mut [u8]) -> Self {
         Self { bytes, len: 0, tail: [0; 4], is_complete: false }
     }

@@ -10,7 +10,7 @@ use super::upward::{Upward, in_packet};
 
 /// A recipe link repeats a safe value after this time.
 const SOON: Duration = Duration::from_millis(4);
-/// After [`NEW`], it repeats a safe value that nothing can show after this time.
+/// A recipe link repeats a safe value after this time if it is older than [`NEW`] and nothing can show it.
 const SLOWLY: Duration = Duration::from_millis(100);
 const NEW: Duration = Duration::from_secs(1);
 /// A value that the controller shows earlier than this may be older than the arrival of the safe value.
