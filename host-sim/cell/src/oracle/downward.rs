@@ -30,13 +30,13 @@ pub(super) struct Downward {
     /// Number of the newest cycle on the grid.
     slot: Option<u64>,
     next_slot_at: Instant,
-    /// The newest cycle's bytes, for a port that sends on changes.
+    /// The bytes of the newest cycle, for a port that sends on changes.
     newest: Option<Vec<u8>>,
-    /// The bytes of the cycle that has begun.
+    /// The bytes sent so far in the current cycle.
     begun: Vec<u8>,
     last_bit: Option<bool>,
     pub heard: Instant,
-    /// Cycles sent, as a counter field shows them.
+    /// Number of cycles sent, as a counter field sends it.
     cycles: u32,
     pub frames_out: u32,
     pub bytes_out: u32,
@@ -44,7 +44,7 @@ pub(super) struct Downward {
     pub stale: u32,
 }
 
-/// Why a value must not be shown. Most are no violation, so it is put into words only for one that is.
+/// Why a value must not be sent. Most of these cases are no violation, so the text is made only for a violation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Hidden {
     Unreadable(SysVar),
@@ -53,7 +53,7 @@ pub(super) enum Hidden {
 }
 
 impl Hidden {
-    /// The violation if it was shown all the same.
+    /// The violation if the value was sent nevertheless.
     pub(super) fn wrong(self, spec: &Spec) -> Wrong {
         match self {
             Self::Unreadable(var) => (Invariant::Unreadable, format!("{var} is unreadable")),
@@ -72,12 +72,12 @@ impl Downward {
         self.is_up && !self.is_bus_off
     }
 
-    /// Whether what was sent has not left, or the line is somebody else's.
+    /// Whether a transmission is not complete, or the line is used by an exchange.
     pub(super) fn is_busy(&self) -> bool {
         self.in_flight
     }
 
-    /// The line is somebody else's until [`Self::sent`].
+    /// The line is used by an exchange until [`Self::sent`].
     pub(super) fn hold(&mut self) {
         self.in_flight = true;
     }
@@ -86,7 +86,7 @@ impl Downward {
         self.due && !self.in_flight && self.is_usable() && now >= self.heard + port.turnaround
     }
 
-    /// A frame becomes due; one that is due already is skipped.
+    /// A frame becomes due. If one is due already, it is skipped.
     pub(super) fn raise(&mut self) {
         if self.due {
             self.skipped = self.skipped.wrapping_add(1);
@@ -104,7 +104,7 @@ impl Downward {
         }
         let slot = now.as_micros() / port.cycle.as_micros();
         self.next_slot_at = Instant::from_micros((slot + 1) * port.cycle.as_micros());
-        // On the first call, the present cycle has just begun.
+        // On the first call, the current cycle has just begun.
         let before = self.slot.replace(slot).unwrap_or(slot.saturating_sub(1));
         if slot == before || !self.is_usable() {
             return;
@@ -180,7 +180,7 @@ impl Downward {
         })
     }
 
-    /// A request of so many bytes was sent.
+    /// A request of this many bytes was sent.
     pub(super) fn asked(&mut self, len: usize) {
         self.frames_out = self.frames_out.wrapping_add(1);
         self.bytes_out = self.bytes_out.wrapping_add(len as u32);
@@ -188,7 +188,7 @@ impl Downward {
         self.in_flight = true;
     }
 
-    /// Checks a frame that the engine sends; `id` is that of a CAN frame.
+    /// Checks a frame that the engine sends; `id` is the id of a CAN frame.
     pub(super) fn check(
         &mut self,
         spec: &Spec,
@@ -266,7 +266,7 @@ impl Downward {
         let texts = port.outputs.iter().flat_map(|frame| &frame.fields);
         let fits = texts.filter(|field| is_text(field)).all(|field| text_of(field, up).is_some());
         if !fits || !port.outputs.iter().all(|frame| self.may_send_values(frame, up)) {
-            // A text that does not fit is not sent, nor is a number that its field may not send.
+            // A text that does not fit is not sent, nor is a number that its field must not send.
             self.due = false;
             self.stale = self.stale.wrapping_add(1);
             return Ok(());
@@ -283,7 +283,7 @@ impl Downward {
     fn is_same(&self, port: &PortSpec, up: &Upward, newest: &[u8]) -> bool {
         let mut rest = newest;
         port.outputs.iter().all(|frame| {
-            // A frame of varying length is the only one of its port.
+            // A frame of varying length is the only output frame of its port.
             let len = if frame.varies { rest.len() } else { frame.payload };
             let Some((part, after)) = rest.split_at_checked(len) else { return false };
             rest = after;
@@ -291,7 +291,7 @@ impl Downward {
         })
     }
 
-    /// Whether the payload has the present values.
+    /// Whether the payload has the current values.
     pub(super) fn agrees(&self, frame: &Frame, up: &Upward, payload: &[u8]) -> bool {
         if let Some(device) = &frame.device {
             let whole = match (&frame.head[..], &frame.tail[..]) {
@@ -319,14 +319,14 @@ impl Downward {
                 }
                 FieldSpec::UserOutput { ty, from } => (ty, self.number(up, ty, from)),
                 FieldSpec::UserInput { ty, .. } => (ty, None),
-                // A plain recipe has no others.
+                // A plain recipe has no other fields.
                 _ => return false,
             };
             let (value, after) = rest.split_at(ty.size());
             rest = after;
             match (number, field) {
                 (Some(number), _) => field_bytes(ty, number)[..ty.size()] == *value,
-                // Reply codes, the state packet's other values and the health of ports are not modelled.
+                // Reply codes, other values of the state packet, and the health of ports are not modelled.
                 (
                     None,
                     FieldSpec::UserOutput {
@@ -343,7 +343,7 @@ impl Downward {
         })
     }
 
-    /// The payload with the present values; `None` if one is not a number.
+    /// The payload with the current values; `None` if one is not a number.
     pub(super) fn made(&self, frame: &Frame, up: &Upward) -> Option<Vec<u8>> {
         let mut bytes = vec![0; frame.payload];
         let places = frame.device.iter().flat_map(|device| &device.places);
@@ -376,7 +376,7 @@ impl Downward {
         }
     }
 
-    /// Whether each field may send its present value.
+    /// Whether each field may send its current value.
     fn may_send_values(&self, frame: &Frame, up: &Upward) -> bool {
         frame.fields.iter().enumerate().all(|(nth, field)| {
             let (encoding, from) = match *field {
@@ -412,7 +412,7 @@ impl Downward {
                 return true;
             }
             FieldSpec::TextOutput { .. } => return text_of(field, up).is_some_and(|text| text == bytes),
-            // None of these is in the output part of a device's recipe.
+            // The output part of a device's recipe has none of these.
             FieldSpec::System(_)
             | FieldSpec::UserInput { .. }
             | FieldSpec::DeviceInput { .. }
@@ -486,7 +486,7 @@ fn is_text(field: &FieldSpec) -> bool {
     matches!(field, FieldSpec::TextOutput { .. })
 }
 
-/// The bytes of a text field with the present values; `None` if they do not fit.
+/// The bytes of a text field with the current values; `None` if they do not fit.
 fn text_of(field: &FieldSpec, up: &Upward) -> Option<Vec<u8>> {
     let FieldSpec::TextOutput { text, from, length_from } = field else { return None };
     let len = match length_from {

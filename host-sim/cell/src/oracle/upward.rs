@@ -1,5 +1,4 @@
-//! The values that are to be written to the controller, and the checks of each write
-//! (proto-core/docs/engine.md section 5).
+//! The values to be written to the controller, and checks of each write (proto-core/docs/engine.md section 5).
 
 mod bits;
 
@@ -17,14 +16,14 @@ use super::invariant::Wrong;
 use super::spec::{LinkSpec, Origin, Owned, Spec};
 use bits::Waits;
 
-/// Maximum number of values per port that wait behind the next ones.
+/// Maximum number of values per port that wait behind the next value of their variable.
 pub(super) const EDGES: usize = 16;
-/// Maximum number of groups of rejected fields that have their time at once.
+/// Maximum number of groups of rejected fields that have separate timeouts at once.
 const GROUPS: usize = 12;
 /// Maximum age of a value that was read back.
 const READ_BACK: Duration = Duration::from_millis(500);
 
-/// After this long without the data that the controller sends steadily, it may have restarted.
+/// After this long without the data that the controller normally sends steadily, it may have restarted.
 const AWAY: Duration = Duration::from_millis(500);
 
 /// Whether no data has come for longer than [`AWAY`].
@@ -35,42 +34,42 @@ pub(super) fn is_gap(last: Option<Instant>, now: Instant) -> bool {
 /// The state of one variable.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Known {
-    /// The value that a port would show now, and when it came.
+    /// The value that a port would send now, and when it arrived.
     pub value: Option<(Raw, Instant)>,
     /// Values to be written, the next one first, each with the time of its frame.
     pub waiting: VecDeque<(Raw, Instant)>,
-    /// When the newest field frame with it was accepted.
+    /// When the newest field frame with the variable was accepted.
     pub accepted: Option<Instant>,
-    /// The same, or when a frame of its owner said that there is nothing to say.
+    /// As `accepted`, but also when a frame of the owner reported that it has no news.
     pub heard: Option<Instant>,
-    /// Its owner is not overdue, or it has its safe value.
+    /// The owner is not overdue, or the variable has its safe value.
     pub live: bool,
-    /// It has its safe value.
+    /// The variable has its safe value.
     pub safe: bool,
-    /// Since when it has it, repetitions included.
+    /// When the safe value was last set, including repetitions.
     pub safe_at: Instant,
-    /// The state stream has shown it since its owner became overdue, or ever.
+    /// The state stream has shown the variable since its owner became overdue, or ever.
     pub read_back: bool,
     /// The newest value from the controller was not finite.
     pub unreadable: bool,
-    /// It has its safe value, and the controller is not known to have it.
+    /// The variable has its safe value, but the controller is not known to have it.
     pub unconfirmed: bool,
-    /// Its owner became overdue before the last value was sent.
+    /// The owner became overdue before the last value was sent.
     pub unsent: bool,
-    /// Values that waited while the gateway slept; `None` once a frame has come since.
+    /// Values that waited while the gateway slept; `None` once a frame has arrived since.
     pub slept: Option<Vec<Raw>>,
-    /// Its field was rejected in the newest frame of its owner.
+    /// The variable's field was rejected in the newest frame of its owner.
     pub alone: Option<Alone>,
-    /// It has its safe value, and has never had another one.
+    /// The variable has its safe value, and never had another value.
     pub unknown: bool,
 }
 
-/// The time of a field that is rejected.
+/// The timeout of a rejected field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Alone {
-    /// When it is overdue; `None` once it was.
+    /// When the field is overdue; `None` once it was.
     pub overdue: Option<Instant>,
-    /// When its newest value came.
+    /// When its newest value arrived.
     pub since: Option<Instant>,
 }
 
@@ -84,11 +83,12 @@ impl Known {
 /// The origin of a value that was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Carried {
-    /// It is a safe value.
+    /// A safe value.
     Safe,
-    /// The controller holds it already, as far as is known, since the last frame of its overdue owner.
+    /// As far as is known, the controller has held the value since the last frame of its overdue owner.
     Held { accepted: Instant },
-    /// It came at this time, in its owner's frame or from the state stream, and may have this age when it is sent.
+    /// The value arrived at this time, in a frame of its owner or from the state stream, and may be this old when it is
+    /// sent.
     Of { arrived: Instant, timeout: Duration },
 }
 
@@ -108,22 +108,22 @@ pub(super) struct Upward {
     pub shares: Vec<Waits>,
     /// When each input frame of each port is overdue.
     overdue: Vec<Vec<Option<Instant>>>,
-    /// When each was accepted last.
+    /// When each input frame was last accepted.
     taken: Vec<Vec<Option<Instant>>>,
     /// The command fields that are rejected, by port, frame and field.
     pub commands_alone: BTreeMap<(usize, usize, usize), Alone>,
     pub counted: Vec<Counted>,
     /// When the links that carry values came up; `None` while they are down.
     pub up: [Option<Instant>; 16],
-    /// The same as a set of bits.
+    /// The links that are up, as a bit set.
     pub are_up: u16,
     pub state_at: Option<Instant>,
-    /// When the newest frame of each recipe link came, on any connection.
+    /// When the newest frame of each recipe link arrived, on any connection.
     pub frame_at: [Option<Instant>; 16],
-    /// When data came that the controller sends steadily, and how often after a gap.
+    /// When data that the controller sends steadily last arrived, and how often it arrived after a gap.
     heard_at: Option<Instant>,
     pub era: u64,
-    /// When a frame was last sent on each recipe link's present connection, and in which era.
+    /// When a frame was last sent on the current connection of each recipe link, and in which era.
     pub handed_over: [Option<(Instant, u64)>; 16],
     /// When a safe value last became unconfirmed.
     pub unconfirmed_at: Instant,
@@ -131,9 +131,9 @@ pub(super) struct Upward {
     pub confirmed_at: Option<Instant>,
     /// When each recipe link repeats safe values.
     pub rewrite_at: [Instant; 16],
-    /// No frame is overdue before this.
+    /// No frame becomes overdue before this.
     next_overdue: Instant,
-    /// No value has waited too long before this.
+    /// No waiting value expires before this.
     pub next_expiry: Instant,
     /// Bit set of variables that may have waiting values, by ordinal: inputs come first.
     pub waits: u128,
@@ -176,7 +176,7 @@ impl Upward {
         self.are_up >> link.0 & 1 == 1
     }
 
-    /// The frames that became overdue, as port and index; their variables get safe values or hold.
+    /// The frames that have become overdue, as port and index. Their variables get safe values, or hold.
     pub(super) fn overdue(&mut self, spec: &Spec, now: Instant) -> Vec<(usize, usize)> {
         let mut overdue = Vec::new();
         if now < self.next_overdue {
@@ -207,7 +207,8 @@ impl Upward {
         overdue
     }
 
-    /// Rejected fields whose own time is over; returns the command fields among them, and whether there is any.
+    /// Handles rejected fields whose own timeout is over. Returns the command fields among them, and whether there were
+    /// any.
     pub(super) fn overdue_alone(&mut self, spec: &Spec, now: Instant) -> (Vec<(usize, usize, usize)>, bool) {
         let is_over =
             |alone: &Option<Alone>| alone.and_then(|alone| alone.overdue).is_some_and(|at| now >= at);
@@ -236,7 +237,7 @@ impl Upward {
         (commands, any)
     }
 
-    /// The time of fields that are rejected in this frame and were not in the one before.
+    /// The timeout of fields that are rejected in this frame but were not in the previous one.
     fn alone(&self, spec: &Spec, nth: usize, frame: usize, now: Instant) -> Alone {
         let since = self.taken[nth][frame];
         let timeout = spec.ports[nth].timeout;
@@ -247,7 +248,7 @@ impl Upward {
         Alone { overdue, since }
     }
 
-    /// Whether the rejected fields of a frame can have a time of their own beside all others.
+    /// Whether the rejected fields of a frame can have a separate timeout, in addition to all others.
     pub(super) fn has_room(&self, spec: &Spec, nth: usize, frame: &Accepted, now: Instant) -> bool {
         let of_var = |var: &SysVar| {
             let owned = spec.owned[var.ordinal()];
@@ -272,7 +273,7 @@ impl Upward {
         !is_new || groups.contains(&own) || groups.len() < GROUPS
     }
 
-    /// Drops values that waited too long.
+    /// Drops values that have waited too long.
     pub(super) fn expire(&mut self, spec: &Spec, now: Instant) {
         if now < self.next_expiry {
             return;
@@ -320,7 +321,7 @@ impl Upward {
         }
     }
 
-    /// A frame came that says nothing: its device is there.
+    /// A frame without news arrived, so its device is present.
     pub(super) fn not_overdue(&mut self, spec: &Spec, nth: usize, frame: usize, now: Instant) {
         let at = now + spec.ports[nth].timeout;
         self.overdue[nth][frame] = Some(at);
@@ -485,8 +486,8 @@ impl Upward {
         }
     }
 
-    /// A packet or a recipe frame came. After a gap the controller may have restarted: what was handed
-    /// over before by datagram counts no more.
+    /// A packet or a recipe frame arrived. After a gap the controller may have restarted: what was sent before by
+    /// datagram no longer counts.
     pub(super) fn heard(&mut self, now: Instant) {
         if is_gap(self.heard_at.replace(now), now) {
             self.era += 1;
@@ -573,7 +574,7 @@ impl Upward {
         Ok(if known.safe { Carried::Safe } else { Carried::Of { arrived: at, timeout } })
     }
 
-    /// Checks a variable in a frame that was sent for others; returns the value's origin.
+    /// Checks a variable in a frame that was sent because of other variables; returns the value's origin.
     pub(super) fn carried(
         &self,
         spec: &Spec,
@@ -639,7 +640,7 @@ impl Upward {
     }
 }
 
-/// A variable's value in a state packet; `None` if it is not in it or not finite.
+/// The value of a variable in a state packet; `None` if the packet does not have it, or it is not finite.
 pub(super) fn in_packet(var: SysVar, packet: &[u8]) -> Option<Raw> {
     let place = var.stream()?;
     let bytes = packet.get(usize::from(place.offset)..)?.get(..usize::from(place.len))?;

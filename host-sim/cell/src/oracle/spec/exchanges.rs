@@ -1,5 +1,5 @@
-//! What is asked of slaves and devices: requests and replies on a Modbus RTU line by
-//! proto-core/docs/wire/modbus-rtu.md, others by docs/configuration.md section 4.
+//! Exchanges with slaves and devices: requests and replies on a Modbus RTU line by proto-core/docs/wire/modbus-rtu.md,
+//! others by docs/configuration.md section 4.
 //!
 //! Written from these pages, independent of the engine's exchanges.
 
@@ -22,15 +22,15 @@ use crate::rtu::is_right;
 #[derive(Debug, Clone)]
 pub(in crate::oracle) struct ExchangesSpec {
     pub rows: Vec<RowSpec>,
-    /// After this long without a byte, what was sent is complete.
+    /// After this long without a byte, the transmission is complete.
     pub silence: Duration,
-    /// Time of all rows if nobody answers, each once.
+    /// The time that all rows take, once each, if no device replies.
     pub all_costs: Duration,
-    /// Whether own bytes come back.
+    /// Whether the port receives its own bytes.
     pub echo: Echo,
-    /// A slave that was not heard for so long has started.
+    /// A slave that was not heard for this long counts as started.
     pub absent: Duration,
-    /// The input frames of the port that come without being asked for.
+    /// The input frames of the port that come without a request.
     pub unasked: Vec<usize>,
 }
 
@@ -39,12 +39,12 @@ pub(in crate::oracle) struct ExchangesSpec {
 pub(in crate::oracle) struct RowSpec {
     /// Index among the port's exchanges.
     pub nth: usize,
-    /// Address of the slave, 0: all of them; or number of the device.
+    /// Address of the slave, with 0 for a broadcast; or number of the device.
     pub slave: u8,
-    /// Frames of the device's own; `None` on a Modbus line.
+    /// The device's own frames; `None` on a Modbus line.
     pub frames: Option<FramesSpec>,
     pub function: u8,
-    /// What is read or, by a row that only writes, written.
+    /// The first register or coil that is read or, in a row that only writes, written.
     pub address: u16,
     pub count: u16,
     /// The first register or coil that is written.
@@ -57,38 +57,38 @@ pub(in crate::oracle) struct RowSpec {
     pub rising: Option<(SysVar, u8)>,
     pub kind: Kind,
     pub timeout: Duration,
-    /// Repetitions of a state, and of an event.
+    /// Maximum number of repetitions of a state, and of an event.
     pub retries: u8,
     pub event_retries: u8,
-    /// How long after its bit has risen it may be sent.
+    /// How long after the rise of its bit the request may be sent.
     pub trigger: Duration,
-    /// How long after a request its reply may come.
+    /// How long after a request its reply may arrive.
     pub late: Duration,
-    /// The exchanges of its slave, it among them, whose replies look like its own.
+    /// The exchanges of the same slave, including this one, whose replies could be mistaken for its own.
     pub alike: Vec<usize>,
     pub pause: Duration,
-    /// The input frame of the port that the data of its reply is.
+    /// The input frame of the port in the data of the reply.
     pub reply: Option<usize>,
-    /// The data of its request, or a request of the device's own.
+    /// The frame in the data of the request, or a request with the device's own frame.
     pub request: Option<Frame>,
     /// Bytes before the data.
     pub head: Vec<u8>,
 }
 
-/// Why an exchange is asked.
+/// Why an exchange is requested.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::oracle) enum Kind {
     /// A bit rises.
     Event,
-    /// Its slave starts, and it may do something then.
+    /// The slave starts, and the exchange may make it do something.
     Start,
-    /// Something is to be known, or to be as the controller has it.
+    /// A value is read, or is kept as the controller has it.
     State,
 }
 
 impl ExchangesSpec {
-    /// The device whose CANopen node says with this frame that it has booted: 0 with id 0x700 + node, of a node that is
-    /// asked with SDO.
+    /// The device whose CANopen node reports with this frame that it has booted: data 0, with id 0x700 + node, for a
+    /// node that is accessed with SDO.
     pub(in crate::oracle) fn booted(&self, id: CanId, data: &[u8]) -> Option<u8> {
         let (CanId::Standard(id @ 0x701..=0x77F), [0]) = (id, data) else { return None };
         let asked = Some(CanId::Standard(0x600 + (id - 0x700)));
@@ -96,7 +96,7 @@ impl ExchangesSpec {
         of_node.map(|row| row.slave)
     }
 
-    /// The exchanges of a recipe, whose replies are behind its other input frames; `None` without any.
+    /// The exchanges of a recipe, whose replies come after its other input frames; `None` without any.
     pub(in crate::oracle) fn new(
         config: &GatewayConfig,
         recipe: &Recipe,
@@ -164,7 +164,7 @@ impl ExchangesSpec {
         self.rows_of(slave).map(|(_, row)| row.timeout).min().unwrap_or_default()
     }
 
-    /// The exchange of a request; `id` is that of a CAN frame, and `is_remote` says that it has no data.
+    /// The exchange to which a request belongs. `id` is the id of a CAN frame; `is_remote`: it is a remote frame.
     pub(in crate::oracle) fn row_of(
         &self,
         (id, is_remote): (Option<CanId>, bool),
@@ -183,7 +183,7 @@ impl ExchangesSpec {
         })
     }
 
-    /// What bytes of a line are that come unasked.
+    /// Interprets bytes of a line as an unsolicited frame.
     pub(in crate::oracle) fn see_unasked(&self, port: &PortSpec, bytes: &[u8]) -> Seen {
         self.unasked.iter().fold(Seen::No, |seen, &nth| {
             seen.or(Seen::of(look(&port.inputs[nth], bytes), |len| Seen::Unasked(len, nth)))
@@ -240,7 +240,7 @@ impl RowSpec {
         }
     }
 
-    /// Whether nothing in a good reply tells it from one to the other exchange.
+    /// Whether nothing in a valid reply distinguishes it from a reply to the other exchange.
     fn is_answered_like(&self, other: &Self) -> bool {
         match (&self.frames, &other.frames) {
             (Some(one), Some(other)) => match (&one.reply, &other.reply) {
@@ -256,17 +256,17 @@ impl RowSpec {
         }
     }
 
-    /// How long nothing is sent behind a request that nobody answers, at least.
+    /// How long at least nothing is sent after a request without a reply.
     pub(in crate::oracle) fn rest(&self, turnaround: Duration) -> Duration {
         if self.frames.is_some() { self.pause.max(turnaround) } else { self.pause + AFTER_BROADCAST }
     }
 
-    /// Whether the device takes values or orders with the request.
+    /// Whether the request carries values or orders for the device.
     pub(in crate::oracle) fn is_written(&self) -> bool {
         self.written.is_some() || self.request.is_some()
     }
 
-    /// Whether the request can be made at any time: none of its values can be unknown.
+    /// Whether the request can be sent at any time, because none of its values can be unknown.
     pub(in crate::oracle) fn is_always_ready(&self) -> bool {
         let request = self.request.iter().flat_map(|request| &request.fields);
         request.filter_map(FieldSpec::source).all(|source| {
@@ -316,7 +316,7 @@ impl RowSpec {
         matches!(self.function, 5 | 15)
     }
 
-    /// Bytes of data in the request.
+    /// Number of data bytes in the request.
     fn data_len(&self) -> usize {
         match self.function {
             1..=4 => 0,
@@ -332,7 +332,7 @@ impl RowSpec {
         self.head.len() + self.data_len() + 2
     }
 
-    /// Bytes of data in the reply; `None` if it repeats the request's beginning.
+    /// Number of data bytes in the reply; `None` if it repeats the beginning of the request.
     fn reply_data(&self) -> Option<usize> {
         match self.function {
             1 | 2 => Some(usize::from(self.count.div_ceil(8))),
@@ -341,7 +341,7 @@ impl RowSpec {
         }
     }
 
-    /// How many bytes of the request a reply without data repeats.
+    /// How many bytes of the request are repeated in a reply without data.
     fn repeated(&self) -> usize {
         if self.function == 22 { 8 } else { 6 }
     }
@@ -353,7 +353,8 @@ impl RowSpec {
         self.reply_data().map_or(self.repeated() + 2, |len| len + 5)
     }
 
-    /// The data of a request, as its fields have it: one coil in the lowest bit. Of a device's own frame, all of it.
+    /// The data of a request as its fields have it: a single coil in the lowest bit. For a device's own frame, the
+    /// whole frame.
     pub(in crate::oracle) fn data_of(&self, request: &[u8]) -> Vec<u8> {
         if self.frames.is_some() {
             return request.to_vec();
@@ -362,7 +363,7 @@ impl RowSpec {
         if self.function == 5 { vec![u8::from(data[0] == 0xFF)] } else { data.to_vec() }
     }
 
-    /// The data that registers or coils with these values are, or bytes.
+    /// The data for registers or coils with these values, or for bytes.
     pub(in crate::oracle) fn data_from(&self, values: &[u16]) -> Vec<u8> {
         if self.frames.is_some() {
             return values.iter().map(|&byte| byte as u8).collect();
@@ -374,7 +375,7 @@ impl RowSpec {
         values.chunks(8).map(byte).collect()
     }
 
-    /// The registers or coils that a slave takes from this data; of a device's own frame, the bytes.
+    /// The registers or coils that a slave accepts from this data; for a device's own frame, the bytes.
     pub(in crate::oracle) fn values_of(&self, data: &[u8]) -> Vec<u16> {
         if self.frames.is_some() {
             return data.iter().copied().map(u16::from).collect();
@@ -386,12 +387,12 @@ impl RowSpec {
         (0..count).map(|nth| u16::from(data[nth / 8] >> (nth % 8) & 1)).collect()
     }
 
-    /// The system variables in its request.
+    /// The system variables in the request.
     pub(in crate::oracle) fn shown(&self) -> impl Iterator<Item = SysVar> {
         self.request.iter().flat_map(|request| request.shown.iter().copied())
     }
 
-    /// The same of a reply that comes too late, if `request` was the newest one; a wrong checksum is nothing.
+    /// As [`Self::see`], for a late reply if `request` was the newest one. Bytes with a wrong checksum are no reply.
     pub(in crate::oracle) fn see_late(&self, request: Option<&[u8]>, bytes: &[u8]) -> Seen {
         match (&self.frames, request) {
             (Some(_), _) => self.see(&[], bytes),
@@ -403,7 +404,7 @@ impl RowSpec {
         }
     }
 
-    /// Whether a frame on a bus is the abort of this SDO request, where the file has no other refusal.
+    /// Whether a frame on a bus is the abort of this SDO request, if the file defines no other refusal.
     pub(in crate::oracle) fn is_abort(&self, request: &[u8], id: CanId, frame: &[u8]) -> bool {
         let Some(FramesSpec { reply: Some(reply), refusal: None, .. }) = &self.frames else { return false };
         let is_sdo = match (self.request.as_ref().and_then(|own| own.id), reply.id) {
@@ -414,7 +415,7 @@ impl RowSpec {
         is_sdo && Some(id) == reply.id && is_whole && frame[0] == 0x80 && frame[1..4] == request[1..4]
     }
 
-    /// What the bytes that came are, if they follow this request.
+    /// Interprets the bytes received after this request.
     pub(in crate::oracle) fn see(&self, request: &[u8], bytes: &[u8]) -> Seen {
         if let Some(frames) = &self.frames {
             return frames.see(bytes);
@@ -429,7 +430,7 @@ impl RowSpec {
         }
         let head = match self.reply_data() {
             Some(len) => vec![self.slave, self.function, len as u8],
-            // One register or coil is in the reply with its value.
+            // The reply to a write of one register or coil contains its value.
             None => request[..self.repeated()].to_vec(),
         };
         let seen = bytes.len().min(head.len());
@@ -446,5 +447,5 @@ impl RowSpec {
 
 /// After a request to all slaves, nothing is sent for this long.
 const AFTER_BROADCAST: Duration = Duration::from_millis(100);
-/// More than request and reply take on a bus.
+/// More than a request and its reply take on a bus.
 const ON_A_BUS: Duration = Duration::from_millis(20);

@@ -1,5 +1,5 @@
-//! Exchanges of a device's own frames (docs/configuration.md section 4, "Exchanges"): the request, what
-//! answers it, and which bytes are which.
+//! Exchanges with a device's own frames (docs/configuration.md section 4, "Exchanges"): the request, its replies, and
+//! how received bytes are interpreted.
 //!
 //! Written from that page, independent of the engine's exchanges.
 
@@ -10,10 +10,10 @@ use crate::oracle::device::Look;
 use crate::oracle::frame::{Frame, device_frame};
 use crate::oracle::varying::look;
 
-/// The frames of one exchange, apart from its request.
+/// The frames of an exchange, without its request.
 #[derive(Debug, Clone, Default)]
 pub(in crate::oracle) struct FramesSpec {
-    /// Without a request the reply comes unasked.
+    /// The exchange has a request; without one, the reply is unsolicited.
     pub is_asked: bool,
     /// The request is a remote frame with this id.
     pub remote: Option<CanId>,
@@ -22,7 +22,7 @@ pub(in crate::oracle) struct FramesSpec {
 }
 
 impl FramesSpec {
-    /// What the bytes that came are, if they follow the request.
+    /// Interprets the bytes received after the request.
     pub(in crate::oracle) fn see(&self, bytes: &[u8]) -> Seen {
         let reply = self.reply.as_ref().map_or(Look::No, |reply| look(reply, bytes));
         let refusal = self.refusal.as_ref().map_or(Look::No, |refusal| look(refusal, bytes));
@@ -30,12 +30,12 @@ impl FramesSpec {
     }
 }
 
-/// What bytes are while a reply is pending.
+/// The meaning of bytes while a reply is pending.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::oracle) enum Seen {
-    /// Not the beginning of what is expected.
+    /// Not the beginning of an expected frame.
     No,
-    /// Perhaps its beginning; whether all constants so far are its own.
+    /// Possibly the beginning of an expected frame; and whether all constants so far match.
     Begins {
         is_ours: bool,
     },
@@ -47,13 +47,13 @@ pub(in crate::oracle) enum Seen {
     ReplyOrEcho(usize),
     /// A reply to an earlier request of another exchange: its length, and which exchange.
     Late(usize, usize),
-    /// A refusal of one of several requests.
+    /// A refusal that may belong to one of several requests.
     Ambiguous(usize),
-    /// A frame that comes unasked: its length, and which input frame of the port it is.
+    /// An unsolicited frame: its length, and its index among the input frames of the port.
     Unasked(usize, usize),
     /// A frame of another device.
     Other(usize),
-    /// It would be the reply, but its checksum is wrong.
+    /// It would be the reply, but its checksum is invalid.
     Wrong(usize),
 }
 
@@ -68,7 +68,7 @@ impl Seen {
         }
     }
 
-    /// The same of an exchange that is not pending.
+    /// The meaning for an exchange that is not pending.
     pub(in crate::oracle) fn late(self, row: usize) -> Self {
         match self {
             Self::Reply(len) | Self::Refusal(len) => Self::Late(len, row),
@@ -76,9 +76,9 @@ impl Seen {
         }
     }
 
-    /// What bytes are that may be one of two frames: a frame is more than the beginning of one of ours, that
-    /// is more than one of others, and that is more than the beginning of one of others or a wrong
-    /// checksum. Of equals, the first.
+    /// Combines the meanings of bytes that may be one of two frames. A complete frame ranks above the beginning of a
+    /// frame of ours, that above a complete frame of another device, and that above the beginning of such a frame or an
+    /// invalid checksum. Of equal ranks, the first one counts.
     pub(in crate::oracle) fn or(self, other: Self) -> Self {
         let rank = |seen: &Self| match seen {
             Self::No => 0,
@@ -102,6 +102,6 @@ impl Seen {
 pub(in crate::oracle) fn frame_of(config: &GatewayConfig, nth: u8) -> Option<(&FrameSpec, Frame)> {
     let spec = config.frames.get(usize::from(nth))?;
     let fields = spec.fields.of(&config.fields);
-    // A remote frame has none.
+    // A remote frame has no fields.
     Some((spec, device_frame(&spec.head, &spec.tail, spec.id, fields)))
 }

@@ -21,14 +21,14 @@ pub(in crate::oracle) struct Block {
     pub table: Table,
     pub first: u16,
     pub count: u16,
-    /// The input frame of the port that a master writes.
+    /// The input frame of the port, written by a master.
     pub input: Option<usize>,
-    /// What a master reads.
+    /// The frame that a master reads.
     pub output: Option<Frame>,
 }
 
 impl ServedSpec {
-    /// The blocks of a recipe, which are behind its other input frames; `None` without any.
+    /// The blocks of a recipe, which come after its other input frames; `None` without any.
     pub(in crate::oracle) fn new(
         config: &GatewayConfig,
         recipe: &Recipe,
@@ -59,7 +59,7 @@ impl ServedSpec {
         self.blocks.iter().filter_map(|block| block.output.as_ref()).flat_map(|out| out.shown.iter().copied())
     }
 
-    /// The block with this register or coil.
+    /// The block that contains this register or coil.
     pub(in crate::oracle) fn block_at(&self, table: Table, at: u16) -> Option<(usize, &Block)> {
         let has = |block: &Block| at.checked_sub(block.first).is_some_and(|nth| nth < block.count);
         self.blocks.iter().enumerate().find(|(_, block)| block.table == table && has(block))

@@ -1,7 +1,7 @@
-//! Bits with owners (proto-core/docs/engine.md section 5): the bits that one input frame writes in one byte
-//! wait together, and are written by Modbus as coils.
+//! Bits with owners (proto-core/docs/engine.md section 5): the bits that one input frame writes in one byte wait
+//! together, and are written by Modbus as coils.
 //!
-//! Bytes that a recipe link carries or that an output part shows have no model: `unmodelled.rs`.
+//! Bytes on a recipe link or in an output part are not modelled: `unmodelled.rs`.
 
 use std::collections::VecDeque;
 
@@ -20,13 +20,13 @@ use crate::oracle::spec::Spec;
 pub(in crate::oracle) struct Waits {
     /// Values to be written, the next one first, each with the time of its frame.
     waiting: VecDeque<(u8, Instant)>,
-    /// The bits of the next one that were not written yet.
+    /// The bits of the next value that are not written yet.
     left: u8,
     pub accepted: Option<Instant>,
-    /// It has its safe value, and since when.
+    /// The share has its safe value; `safe_at` says since when.
     safe: bool,
     safe_at: Instant,
-    /// A field of it was rejected in the newest frame.
+    /// A field of the share was rejected in the newest frame.
     pub alone: Option<Alone>,
 }
 
@@ -73,7 +73,7 @@ impl Upward {
         undelivered
     }
 
-    /// A frame is overdue: its bits take their safe values, or hold.
+    /// A frame is overdue: its bits get their safe values, or hold.
     pub(in crate::oracle) fn bits_silent(&mut self, spec: &Spec, nth: usize, frame: usize, now: Instant) {
         for (place, share) in spec.shares.iter().enumerate() {
             if (share.port, share.frame) == (nth, frame) && self.shares[place].alone.is_none() {
@@ -82,14 +82,14 @@ impl Upward {
         }
     }
 
-    /// The same of one share.
+    /// As [`Self::bits_silent`], for one share.
     pub(in crate::oracle) fn share_silent(&mut self, spec: &Spec, place: usize, now: Instant) {
         let (share, state) = (&spec.shares[place], &mut self.shares[place]);
         let waited = state.waiting.len() as u32;
         state.waiting.clear();
         match share.safe {
             Some(safe) => {
-                // Its owner may never have sent it.
+                // The owner may never have sent the share.
                 state.accepted = state.accepted.or(Some(now));
                 state.waiting.push_back((safe, now));
                 (state.left, state.safe, state.safe_at) = (share.mask, true, now);
@@ -98,7 +98,7 @@ impl Upward {
         }
     }
 
-    /// Drops values of a port that waited too long.
+    /// Drops values of a port that have waited too long.
     pub(in crate::oracle) fn expire_bits(
         &mut self,
         spec: &Spec,
@@ -130,7 +130,7 @@ impl Upward {
         }
     }
 
-    /// Queues safe bits again, if they are still current: each a share and its bits.
+    /// Queues safe bits again, unless they are no longer current. `bits` has shares with their bits.
     pub(in crate::oracle) fn bits_again(&mut self, spec: &Spec, bits: impl IntoIterator<Item = (usize, u8)>) {
         for (place, mask) in bits {
             let state = &mut self.shares[place];
@@ -203,13 +203,13 @@ impl Upward {
         Ok((carried, safe))
     }
 
-    /// Number of the port's values of bits that wait behind others.
+    /// Number of the port's bit values that wait behind others.
     pub(in crate::oracle) fn queued_bits(&self, spec: &Spec, nth: usize) -> usize {
         let own = self.shares.iter().zip(&spec.shares).filter(|(_, share)| share.port == nth);
         own.map(|(state, _)| state.waiting.len().saturating_sub(1)).sum()
     }
 
-    /// A byte with bits that wait.
+    /// A byte with waiting bits.
     pub(in crate::oracle) fn waiting_bits(&self, spec: &Spec) -> Option<SysVar> {
         let mut shares = self.shares.iter().zip(&spec.shares);
         shares.find(|(state, _)| !state.waiting.is_empty()).map(|(_, share)| share.var)
