@@ -1,4 +1,4 @@
-//! The frames in the bytes that a field port received, and their values: a plain implementation of
+//! Finds frames and their values in the bytes that a field port received: a plain implementation of
 //! proto-core/docs/wire/recipes.md sections 4, 6 and 7.
 
 mod cut;
@@ -20,7 +20,7 @@ use super::spec::PortSpec;
 use super::varying;
 use cut::CutWatch;
 
-/// Whether a frame is accepted.
+/// Whether a frame is accepted or rejected, and why.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Verdict {
     Accepted(Accepted),
@@ -32,11 +32,11 @@ pub(super) enum Verdict {
     WrongChecksum,
     /// A frame of another device.
     OtherDevice,
-    /// The alive counter is that of the frame before.
+    /// The alive counter is equal to that of the previous frame.
     Repeated,
-    /// No frame has the length of what came between two ends.
+    /// No frame has the length of the bytes between two ends.
     WrongLength,
-    /// A text of the port's frame with this index says that there is nothing to say.
+    /// A text in the port's frame with this index reports that the device has no news.
     Ignored(usize),
 }
 
@@ -50,22 +50,23 @@ pub(super) struct Accepted {
     pub bits: Vec<Coils>,
     /// Reserved bits were set.
     pub masked: bool,
-    /// Values of command fields: the field's index in the frame, its table, when it picks a command, and the value.
+    /// Values of command fields: the index of the field in the frame, its table, when it selects a command, and the
+    /// value.
     pub commands: Vec<(usize, Span, CommandWhen, i64)>,
     /// The alive counters, each with the place of its field.
     pub counts: Vec<((usize, usize), u32)>,
-    /// How many of them are not the next one.
+    /// How many alive counters are not the next number.
     pub jumps: u32,
     /// Variables that become the number of accepted frames.
     pub counted: Vec<SysVar>,
-    /// What the frame has no value for.
+    /// The fields for which the frame has no value.
     pub without: Box<Without>,
-    /// When it was asked for first, if an earlier request had no reply in time: its values may be as old as that.
+    /// When its values were first requested, if an earlier request had no reply in time: they may be that old.
     pub asked: Option<Instant>,
 }
 
 impl Accepted {
-    /// Notes what tells whether a field's newest value was taken; returns whether anything does.
+    /// Sets the variables that tell whether a field's newest value was accepted. Returns whether there are any.
     fn note_validity(&mut self, rules: &[FieldSpec], is_valid: bool) -> bool {
         let number = f64::from(u8::from(is_valid));
         for rule in rules {
@@ -83,7 +84,7 @@ impl Accepted {
         false
     }
 
-    /// Notes an alive counter.
+    /// Records an alive counter.
     fn count(
         &mut self,
         place: (usize, usize),
@@ -113,7 +114,7 @@ pub(super) struct Coils {
     pub on: u8,
 }
 
-/// Why a field of a device's frame is rejected, or for a counter the frame.
+/// Why a field of a device's frame is rejected, or for a counter the whole frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Unfit {
     NotFinite,
@@ -133,18 +134,18 @@ impl From<Unfit> for Verdict {
     }
 }
 
-/// The fields of an accepted frame of a device that are rejected, or that have no value now.
+/// The fields of an accepted frame of a device that are rejected, or that have no value at the moment.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Without {
     pub vars: Vec<SysVar>,
-    /// Bytes with a bit that could not be read: all bits that the frame writes in them.
+    /// Bytes with an unreadable bit: all bits that the frame writes in them count as rejected.
     pub bytes: Vec<SysVar>,
     /// Command fields, by their index in the frame.
     pub commands: Vec<usize>,
-    /// How many are rejected, and what the frame would be rejected for.
+    /// How many fields are rejected, and why the frame would be rejected.
     pub rejected: u32,
     pub why: Option<Unfit>,
-    /// How many have no value, as the device says.
+    /// How many fields have no value, according to the device.
     pub no_value: u32,
 }
 
@@ -175,15 +176,15 @@ pub(super) struct LineWatch {
     pub dropped: u64,
     pub discarded: u64,
     pub frame_bytes: u64,
-    /// How many bytes before the place where a device's next frame is expected; `None` if that is unknown.
+    /// The number of bytes before the expected place of the device's next frame; `None` if that is unknown.
     pub missing: Missing,
     /// The alive counters of the accepted frames.
     pub counts: Counts,
-    /// Of frames that end with a tail or with silence.
+    /// The state of frames that end with a tail or with silence.
     pub cut: CutWatch,
 }
 
-/// At first, and after silence, a frame is expected to begin at once.
+/// At the start, and after silence, a frame is expected to begin at once.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Missing(Option<usize>);
 
@@ -201,7 +202,7 @@ impl LineWatch {
         }
     }
 
-    /// What has begun on the port's line is not continued.
+    /// A frame that has begun on the port's line is not continued.
     pub(super) fn discard_of(&mut self, port: &PortSpec) {
         match port.framing {
             Boundary::Fields => self.discard(),
@@ -236,15 +237,15 @@ impl LineWatch {
         found
     }
 
-    /// Drops the first byte that is held: nothing begins with it.
+    /// Drops the first held byte, as no frame begins with it.
     pub(super) fn drop_one(&mut self) {
         self.held.remove(0);
         self.dropped += 1;
         self.missing.0 = self.missing.0.and_then(|missing| missing.checked_sub(1));
     }
 
-    /// Drops the first byte of a frame of `len` bytes with a wrong checksum; returns whether it counts. A reply
-    /// counts where one was expected, any other frame where it is not within one that has been counted.
+    /// Drops the first byte of a frame of `len` bytes with an invalid checksum. Returns whether it counts: a reply
+    /// counts where one was expected, any other frame unless it is within one that has been counted.
     pub(super) fn drop_wrong(&mut self, len: usize, is_reply: bool) -> bool {
         let counts = self.missing.0.map_or(!is_reply, |missing| missing == 0);
         if counts {
@@ -254,24 +255,24 @@ impl LineWatch {
         counts
     }
 
-    /// Takes a frame of `len` bytes.
+    /// Takes a frame of `len` bytes from the front.
     pub(super) fn take_front(&mut self, len: usize) -> Vec<u8> {
         self.frame_bytes += len as u64;
         self.missing = Missing::default();
         self.held.drain(..len).collect()
     }
 
-    /// Judges a whole frame of a device, the port's `nth`.
+    /// Judges a complete frame of a device; it is the port's `nth` frame.
     pub(super) fn judge(&mut self, frame: &Frame, nth: usize, whole: &[u8]) -> Verdict {
         let verdict = judge_device(frame, nth, whole, &self.counts);
         if let Verdict::Accepted(accepted) = &verdict {
-            // A rejected frame moves no counter.
+            // A rejected frame updates no counter.
             self.counts.extend(accepted.counts.iter().copied());
         }
         verdict
     }
 
-    /// Judges what a master writes: all of it is taken, or nothing.
+    /// Judges the values that a master writes: all of them are accepted, or none.
     pub(super) fn judge_block(&mut self, frame: &Frame, nth: usize, data: &[u8]) -> Verdict {
         let counts = self.counts.clone();
         let verdict = self.judge_data(frame, nth, data);
@@ -318,7 +319,7 @@ impl LineWatch {
         found
     }
 
-    /// Removes what was cut off the held bytes, and counts it.
+    /// Removes the bytes that were cut off from the held ones, and counts them.
     pub(super) fn remove(&mut self, cut: &Cut) {
         self.held.drain(..cut.at);
         self.mismatches += cut.mismatches;
@@ -327,7 +328,7 @@ impl LineWatch {
     }
 }
 
-/// How far held bytes have been looked through for complete frames.
+/// How far held bytes have been searched for complete frames.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Cut {
     at: usize,
@@ -337,7 +338,7 @@ pub(super) struct Cut {
 }
 
 impl Cut {
-    /// The number of bytes that were frames, or are dropped.
+    /// The number of bytes that were frames or are dropped.
     pub(super) fn len(&self) -> usize {
         self.at
     }
@@ -373,7 +374,7 @@ pub(super) fn can(port: &PortSpec, line: &mut LineWatch, received: &CanFrame) ->
     can_of(port.inputs.iter().enumerate(), port.mode, line, received)
 }
 
-/// The same, with the frames that it may be. Frames with one id are told apart by a constant.
+/// As [`can`], for frames that are given. Frames with the same id are distinguished by a constant.
 pub(super) fn can_of<'f>(
     frames: impl Iterator<Item = (usize, &'f Frame)>,
     mode: Mode,
@@ -391,7 +392,7 @@ pub(super) fn can_of<'f>(
         };
         why = match (device.see(&frame.fields, received.data()), why) {
             (Seen::Ours, _) => return Ok(line.judge(frame, nth, received.data())),
-            // Right but for a constant: another device's, whatever the others say.
+            // Valid but for a constant: a frame of another device, whatever the other frames say.
             (Seen::Other | Seen::Nothing, _) | (_, Ok(Verdict::OtherDevice)) => Ok(Verdict::OtherDevice),
             (Seen::WrongChecksum, _) => Ok(Verdict::WrongChecksum),
         };
@@ -399,7 +400,7 @@ pub(super) fn can_of<'f>(
     why
 }
 
-/// Each field is judged by itself; the frame is rejected if a counter is wrong, or if it tells nothing.
+/// Each field is judged on its own. The frame is rejected if a counter is wrong, or if it has no value at all.
 fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Verdict {
     let mut accepted = Accepted { frame: nth, ..Accepted::default() };
     let laid_out = if frame.varies { varying::lay_out(frame, whole).ok() } else { None };
@@ -411,7 +412,7 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
     }) {
         return Verdict::Ignored(nth);
     }
-    // Command fields are counted without what is no element of the frame.
+    // The index of a command field does not count fields without bytes in the frame.
     let mut element = 0;
     let mut tells = false;
     let mut wrong_count = None;
@@ -498,7 +499,7 @@ fn judge_device(frame: &Frame, nth: usize, whole: &[u8], counts: &Counts) -> Ver
     }
 }
 
-/// The number in the bytes of a field; why there is none, or nothing if the device says that it has none.
+/// The number in the bytes of a field, or why there is none; `Err(None)` if the device reports that it has none.
 fn number_in(encoding: &Encoding, bytes: &[u8], rules: &[FieldSpec]) -> Result<f64, Option<Unfit>> {
     match device::read_ruled(encoding, bytes, rules) {
         Read::Number(number) if number.is_finite() => Ok(number),
@@ -508,7 +509,7 @@ fn number_in(encoding: &Encoding, bytes: &[u8], rules: &[FieldSpec]) -> Result<f
     }
 }
 
-/// A number of a device as a value of a variable.
+/// Converts a number of a device to a value of a variable.
 fn bound_by(var: SysVar, number: f64, overflow: Overflow, rules: &[FieldSpec]) -> Result<Raw, Option<Unfit>> {
     let is_int16 = rules.contains(&FieldSpec::InputRule(InputRule::Int16));
     let number = match overflow {
@@ -523,7 +524,7 @@ fn bound_by(var: SysVar, number: f64, overflow: Overflow, rules: &[FieldSpec]) -
     bound(var, number).ok_or(Some(Unfit::OutOfRange))
 }
 
-/// The texts of an input frame, without what fills them up.
+/// The texts of an input frame, without padding.
 fn texts<'f>(
     frame: &'f Frame,
     places: &'f [Range<usize>],
@@ -544,7 +545,7 @@ fn judge(mode: Mode, frame: &Frame, nth: usize, payload: &[u8]) -> Verdict {
         let ty = match field {
             FieldSpec::System(var) => var.ty(),
             FieldSpec::UserInput { ty, .. } | FieldSpec::UserOutput { ty, .. } => *ty,
-            // A plain recipe has no others.
+            // A plain recipe has no other fields.
             _ => continue,
         };
         let (bytes, after) = rest.split_at(ty.size());
