@@ -1,5 +1,5 @@
-//! Commands that field values select: each is sent once or not at all, and urgent ones go first (proto-
-//! core/docs/engine.md section 7).
+//! Commands that field values select: each is sent once or not at all, and urgent ones go first
+//! (proto-core/docs/engine.md section 7).
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
