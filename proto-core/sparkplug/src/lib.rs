@@ -45,12 +45,12 @@
 //! node.handle(now, Input::Time { utc_ms: 1_700_000_000_000 }, &Thermometer);
 //! node.handle(now, Input::Sample { values: &[Some(Value::Float(21.5))], alive: 0 }, &Thermometer);
 //! let mut buf = [0; MIN_BUFFER];
-//! The driver opens a connection and reports it.
+//! // The driver opens a connection and reports it.
 //! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Open);
 //! node.handle(now, Input::Opened, &Thermometer);
-//! The driver stores this number, where it can, so that it survives restarts.
+//! // The driver stores this number, where it can, so that it survives restarts.
 //! assert_eq!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Keep { bd_seq: 0 });
-//! From here on, the driver sends the bytes that it gets, and reports those that it receives.
+//! // From here on, the driver sends the bytes that it gets, and reports those that it receives.
 //! let NodeOutput::Send(connect) = node.poll_output(now, &Thermometer, &mut buf) else { unreachable!() };
 //! assert_eq!(&connect[4..8], b"MQTT");
 //! assert!(matches!(node.poll_output(now, &Thermometer, &mut buf), NodeOutput::Sleep { .. }));
