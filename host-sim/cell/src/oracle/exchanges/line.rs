@@ -1,7 +1,8 @@
-//! The exchanges of one line or bus: the request on its way, its reply, and who is asked when
+//! The exchanges of one line or bus: the request in flight, its reply, and when which exchange may be sent
 //! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Exchanges").
 //!
-//! It does not predict which request is next: it says which ones may be sent, which must not, and how long none may be.
+//! Does not predict the next request. Says which requests may be sent, which must not, and for how long the line may be
+//! idle.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,20 +19,20 @@ use crate::oracle::spec::frames::Seen;
 #[derive(Debug, Clone, Default)]
 pub(in crate::oracle) struct ExchangesWatch {
     flight: Option<Flight>,
-    /// A request that was sent has not left.
+    /// A request was handed over and has not left yet.
     leaving: bool,
     /// The newest request has failed, and may be repeated.
     repeat: Option<Flight>,
     free_at: Instant,
     slaves: BTreeMap<u8, SlaveWatch>,
     rows: Vec<RowWatch>,
-    /// Exchanges that are to be asked at the start and have not been asked since, by slave.
+    /// The start exchanges, by slave, that have not been sent since the port came up.
     opening: BTreeMap<u8, BTreeSet<usize>>,
-    /// Those of them whose values were unknown or stale meanwhile, so that they may have been passed over.
+    /// Start exchanges whose values were unknown or stale at some time, so that the gateway may have skipped them.
     passed: BTreeSet<usize>,
-    /// Whether own bytes come back, as far as it is known.
+    /// Whether the line echoes; `None` if unknown.
     has_echo: Option<bool>,
-    /// The request whose bytes are still to come back, or may come back.
+    /// The request whose echo is expected, or possible.
     echo: Option<Vec<u8>>,
     pub unanswered: u32,
     pub refused: u32,
@@ -41,22 +42,22 @@ pub(in crate::oracle) struct ExchangesWatch {
     pub fault_at: Instant,
 }
 
-/// A request on its way.
+/// A request in flight.
 #[derive(Debug, Clone)]
 pub(in crate::oracle) struct Flight {
     pub row: usize,
     pub request: Vec<u8>,
-    /// When the first of its repetitions was sent.
+    /// When the first transmission was sent.
     pub began: Instant,
-    /// Until when its event may be sent.
+    /// For an event: when it expires.
     expires: Option<Instant>,
     sent: Option<Instant>,
     repeated: u8,
-    /// When the first transmission of it left that had no reply in time.
+    /// When the first transmission without a timely reply left.
     pub timed_out: Option<Instant>,
     is_wrong: bool,
     was_wrong: bool,
-    /// What came is its reply, or its echo.
+    /// A frame arrived that is either the reply or the request's echo.
     may_be_echo: bool,
 }
 
@@ -68,60 +69,60 @@ enum Presence {
     Down,
 }
 
-/// What is known of a slave.
+/// The model of a slave.
 #[derive(Debug, Clone, Default)]
 struct SlaveWatch {
     presence: Presence,
     since: Instant,
     was_heard: bool,
-    /// When the first request left that it has not answered since it was heard, and when the newest one failed.
+    /// When the first request that it has not answered since it was last heard left, and when the newest one failed.
     failing: Option<(Instant, Instant)>,
     failures: u32,
-    /// When something at its start was answered that had failed before.
+    /// When a start exchange was last answered that had failed before.
     opened: Instant,
     asked: Instant,
     started: Instant,
 }
 
-/// What is known of an exchange.
+/// The model of an exchange.
 #[derive(Debug, Clone, Default)]
 struct RowWatch {
-    /// When it was asked last, without repetitions.
+    /// When it was last sent, apart from repetitions.
     asked: Option<Instant>,
     /// The newest request since the port came up.
     request: Option<Vec<u8>>,
-    /// How many replies to earlier transmissions may still come, and until when.
+    /// How many replies to earlier transmissions may still arrive, and until when.
     outstanding: (u8, Instant),
-    /// Until when one of its replies, or one like it, has been pending.
+    /// Until when replies that could be mistaken for its own may arrive.
     blocked_until: Instant,
     was_answered: bool,
     is_missed: bool,
     failures: u32,
-    /// It is asked at this instant at the latest, as far as its own failures go.
+    /// After its own failures, it is sent at this instant at the latest.
     retry_at: Instant,
     is_unconfirmed: bool,
     is_refused: bool,
-    /// It may be sent at the start.
+    /// It may be sent as a start exchange.
     starts: bool,
     last_bit: Option<bool>,
-    /// Its bit has risen, and it may be sent until then.
+    /// Its bit has risen; the event may be sent until this instant.
     risen: Option<Instant>,
 }
 
-/// What a device has answered.
+/// How a request was answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ended {
     Good,
-    /// For good.
+    /// Refused for good.
     Refused,
-    /// It has not executed it.
+    /// Not executed.
     Busy,
-    /// It may have executed it.
+    /// Possibly executed.
     Unclear,
 }
 
 impl Ended {
-    /// What a refusal means: on Modbus its code says that.
+    /// The meaning of a refusal, which on Modbus depends on its code.
     pub(super) const fn refused(code: u8, is_modbus: bool) -> Self {
         match code {
             6 if is_modbus => Self::Busy,
@@ -148,7 +149,7 @@ impl RowWatch {
 }
 
 impl ExchangesWatch {
-    /// The device of the port is there, perhaps another one.
+    /// The port is up, perhaps with another device.
     pub(in crate::oracle) fn begin(&mut self, exchanges: Option<&ExchangesSpec>, now: Instant) {
         let Some(exchanges) = exchanges else { return };
         self.abandon(Some(exchanges), now);
@@ -162,7 +163,7 @@ impl ExchangesWatch {
                 self.opening.entry(row.slave).or_default().insert(row.nth);
             }
             if row.is_answered() {
-                // Nobody knows what was asked before.
+                // Earlier requests are unknown and may still be answered.
                 watch.outstanding = (u8::MAX, now + row.late);
                 watch.blocked_until = now + row.late;
             }
@@ -171,9 +172,9 @@ impl ExchangesWatch {
         (self.began, self.fault_at) = (now, now);
     }
 
-    /// What has begun is not continued.
+    /// The gateway abandons the request in flight.
     pub(in crate::oracle) fn abandon(&mut self, exchanges: Option<&ExchangesSpec>, now: Instant) {
-        // A request that is about to be repeated counts as one that was.
+        // A request that is about to be repeated counts as repeated.
         let flight = self.flight.take().or(self.repeat.take().map(|mut flight| {
             flight.repeated += 1;
             flight
@@ -181,7 +182,8 @@ impl ExchangesWatch {
         if let Some((flight, exchanges)) = flight.zip(exchanges)
             && exchanges.rows[flight.row].is_answered()
         {
-            // Behind the newest transmission that has left; one that has not may wait as long from now on.
+            // Replies may arrive for the late time after the newest transmission left. If it has not left yet, the
+            // gateway may wait as long from now on.
             let late = exchanges.rows[flight.row].late;
             match flight.sent {
                 Some(sent) => self.leaves(exchanges, flight.row, flight.repeated + 1, sent + late, now),
@@ -200,7 +202,7 @@ impl ExchangesWatch {
         self.leaving = false;
     }
 
-    /// Replies to an exchange may come until then.
+    /// Up to `count` replies to an exchange may arrive until this instant.
     fn leaves(&mut self, exchanges: &ExchangesSpec, row: usize, count: u8, until: Instant, now: Instant) {
         self.rows[row].leaves(count, until, now);
         for &other in &exchanges.rows[row].alike {
@@ -208,18 +210,18 @@ impl ExchangesWatch {
         }
     }
 
-    /// Whether nothing is on its way or about to be repeated.
+    /// Whether no request is in flight or about to be repeated.
     fn is_free(&self) -> bool {
         self.flight.is_none() && self.repeat.is_none() && !self.leaving
     }
 
-    /// Looks for exchanges that are to be asked at the start and cannot be.
+    /// Notes the start exchanges that cannot be sent now.
     pub(super) fn look_at_opening(&mut self, can_ask: impl Fn(usize) -> bool) {
         let Self { opening, passed, .. } = self;
         passed.extend(opening.values().flatten().copied().filter(|&row| !can_ask(row)));
     }
 
-    /// Bits that ask have changed. A rise needs a 0 that was read before.
+    /// The bits of events may have changed. Only a rise from a known 0 is an event.
     pub(super) fn watch(
         &mut self,
         exchanges: &ExchangesSpec,
@@ -236,7 +238,7 @@ impl ExchangesWatch {
         }
     }
 
-    /// The line is free for a request, and no other one comes first.
+    /// Checks that the line is free for a request, and that no repetition goes first.
     fn check_turn(
         &self,
         port: &PortSpec,
@@ -262,7 +264,7 @@ impl ExchangesWatch {
         Ok(())
     }
 
-    /// A slave that does not answer is only asked what it can answer, and rarely.
+    /// Checks that a slave that is away only gets requests that have a reply, and rarely enough.
     fn check_presence(
         &mut self,
         exchanges: &ExchangesSpec,
@@ -312,7 +314,7 @@ impl ExchangesWatch {
             let what = format!("{}: asked although its bit has not risen just now", name(spec));
             return Err((Invariant::Cycle, what));
         }
-        // What was away for long enough may be asked before it is heard.
+        // A device that was away for long enough may get its start exchanges before it is heard.
         let failing = self.slaves.get(&spec.slave).and_then(|slave| slave.failing);
         let is_away = failing.is_some_and(|(since, _)| now.saturating_since(since) >= exchanges.absent);
         let starts = std::mem::take(&mut self.rows[row].starts) || is_away;
@@ -368,13 +370,13 @@ impl ExchangesWatch {
         Ok(())
     }
 
-    /// The request has come back.
+    /// The echo of the request arrived.
     pub(super) fn echoed(&mut self) {
         self.echo = None;
         self.has_echo.get_or_insert(true);
     }
 
-    /// What came is the reply, or the echo of the request.
+    /// A frame arrived that is either the reply or the request's echo.
     pub(super) fn heard_reply_or_echo(&mut self) {
         if let Some(flight) = &mut self.flight {
             flight.may_be_echo = true;
@@ -382,10 +384,10 @@ impl ExchangesWatch {
         self.echo = None;
     }
 
-    /// What is to be asked at the start of a slave before this exchange, and could be.
+    /// The start exchange of a slave that could be sent and must come before this exchange.
     fn comes_first(&self, exchanges: &ExchangesSpec, slave: u8, row: usize) -> Option<usize> {
         let opening = self.opening.get(&slave)?;
-        // What nobody answers waits for a slave that does not.
+        // While a slave is away, exchanges without a reply wait.
         let is_down = self.slaves.get(&slave).is_some_and(|slave| slave.presence == Presence::Down);
         let may_be = |nth: &usize| {
             (!is_down || exchanges.rows[*nth].is_answered()) && !self.start_waits(exchanges, *nth)
@@ -395,7 +397,7 @@ impl ExchangesWatch {
         (!is_itself).then_some(first)
     }
 
-    /// Whether a start waits for a sign of life of its slave, for which another exchange asks.
+    /// Whether a start exchange waits until its slave is up, because a periodic exchange shows whether it is.
     fn start_waits(&self, exchanges: &ExchangesSpec, row: usize) -> bool {
         let spec = &exchanges.rows[row];
         let is_up = self.slaves.get(&spec.slave).is_some_and(|slave| slave.presence == Presence::Up);
@@ -423,19 +425,19 @@ impl ExchangesWatch {
         }
     }
 
-    /// Whether a reply to a request that has left is pending.
+    /// Whether the line waits for the reply to a request that has left.
     pub(in crate::oracle) fn waits(&self) -> bool {
         self.flight.as_ref().is_some_and(|flight| flight.sent.is_some())
     }
 
-    /// The exchanges whose replies may come although none is pending, each with its newest request.
+    /// The exchanges with outstanding replies, except the one in flight.
     fn late_rows(&self, now: Instant) -> impl Iterator<Item = (usize, &RowWatch)> {
         let own = self.flight.as_ref().map(|flight| flight.row);
         let rows = self.rows.iter().enumerate();
         rows.filter(move |(nth, row)| Some(*nth) != own && row.is_outstanding(now))
     }
 
-    /// What the bytes that are held begin with.
+    /// Interprets the beginning of the bytes received so far.
     pub(super) fn see(&self, port: &PortSpec, exchanges: &ExchangesSpec, bytes: &[u8], now: Instant) -> Seen {
         let echo = match &self.echo {
             None => Seen::No,
@@ -446,9 +448,9 @@ impl ExchangesWatch {
             },
         };
         let answer = match &self.flight {
-            // The reply is looked for behind the echo.
+            // The reply can only come after the echo.
             _ if self.has_echo == Some(true) && self.echo.is_some() => Seen::No,
-            // Nobody answers what is for all.
+            // A broadcast has no reply.
             Some(flight) if exchanges.rows[flight.row].is_answered() => {
                 exchanges.rows[flight.row].see(&flight.request, bytes)
             }
@@ -462,18 +464,18 @@ impl ExchangesWatch {
             _ => answer.or(echo),
         };
         match (answer, late) {
-            // It may be one to an earlier request.
+            // It may refuse an earlier request.
             (Seen::Refusal(len), Seen::Late(other, _)) if other == len => Seen::Ambiguous(len),
             _ => answer.or(late).or(exchanges.see_unasked(port, bytes)),
         }
     }
 
-    /// The exchange whose reply is pending, and its request.
+    /// The exchange in flight, and its request.
     pub(super) fn pending<'t>(&self, exchanges: &'t ExchangesSpec) -> Option<(&'t RowSpec, &[u8])> {
         self.flight.as_ref().map(|flight| (&exchanges.rows[flight.row], &flight.request[..]))
     }
 
-    /// The exchange that was not answered in time, and that `is` a reply to.
+    /// The exchange with an outstanding reply for which `is` holds.
     pub(super) fn late_of(
         &self,
         exchanges: &ExchangesSpec,
@@ -483,14 +485,14 @@ impl ExchangesWatch {
         self.late_rows(now).map(|(nth, _)| nth).find(|&nth| is(&exchanges.rows[nth]))
     }
 
-    /// A late reply to this exchange came. Returns the slave if it has started.
+    /// A late reply to this exchange arrived. Returns the slave if it has started.
     pub(super) fn came_late(&mut self, exchanges: &ExchangesSpec, row: usize, now: Instant) -> Option<u8> {
         let outstanding = &mut self.rows[row].outstanding;
         outstanding.0 = outstanding.0.saturating_sub(1);
         self.heard(exchanges, exchanges.rows[row].slave, now)
     }
 
-    /// An answer came that may belong to one of several requests.
+    /// A reply arrived that may belong to any of several requests. Returns the slave if it has started.
     pub(super) fn came_ambiguous(&mut self, exchanges: &ExchangesSpec, now: Instant) -> Option<u8> {
         let slave = exchanges.rows[self.flight.as_ref()?.row].slave;
         self.heard(exchanges, slave, now)
@@ -511,7 +513,7 @@ impl ExchangesWatch {
     ) -> Option<(Flight, Option<u8>)> {
         let flight = self.flight.take()?;
         let spec = &exchanges.rows[flight.row];
-        // Two copies behind a repetition, or behind a request whose earlier reply may still come, may be two replies.
+        // After a repetition, or while an earlier reply is outstanding, two equal frames may also be two replies.
         let is_sure = flight.repeated == 0 && !self.rows[flight.row].is_outstanding(now);
         if is_sure && (flight.may_be_echo || self.echo.is_some()) {
             self.has_echo.get_or_insert(flight.may_be_echo);
@@ -529,7 +531,7 @@ impl ExchangesWatch {
         self.echo = None;
     }
 
-    /// So many replies to a request may still come.
+    /// Up to `count` replies to a request may still arrive.
     fn leaves_of(
         &mut self,
         exchanges: &ExchangesSpec,
@@ -542,7 +544,7 @@ impl ExchangesWatch {
         if flight.timed_out.is_some() {
             self.leaves(exchanges, flight.row, count, sent + spec.late, now);
         } else if flight.was_wrong && spec.alike.len() > 1 {
-            // It may have been noise, with the reply behind it.
+            // The damaged frame may have been noise before the reply.
             self.leaves(
                 exchanges,
                 flight.row,
@@ -553,7 +555,7 @@ impl ExchangesWatch {
         }
     }
 
-    /// A request has ended with a sign of its slave.
+    /// A request has ended, and its slave was heard.
     fn ended(
         &mut self,
         exchanges: &ExchangesSpec,
@@ -565,7 +567,7 @@ impl ExchangesWatch {
         let watch = &mut self.rows[flight.row];
         (watch.was_answered, watch.is_unconfirmed) = (true, false);
         if spec.at_start && watch.failures > 0 {
-            // The others may have waited for it.
+            // Other exchanges may have waited for this one.
             self.slaves.entry(spec.slave).or_default().opened = now;
         }
         match ended {
@@ -580,7 +582,7 @@ impl ExchangesWatch {
         self.heard(exchanges, spec.slave, now)
     }
 
-    /// A sign of life of a slave. Returns it if it has started: what is asked at its start is asked again.
+    /// A slave was heard. Returns the slave if it has started: its start exchanges are due again.
     pub(super) fn heard(&mut self, exchanges: &ExchangesSpec, number: u8, now: Instant) -> Option<u8> {
         let slave = self.slaves.entry(number).or_default();
         let has_started =
@@ -599,7 +601,7 @@ impl ExchangesWatch {
         has_started.then_some(number)
     }
 
-    /// A CANopen node said that it has booted: what is asked at its start is asked again.
+    /// A CANopen node reported that it has booted: its start exchanges are due again.
     pub(super) fn booted(&mut self, exchanges: &ExchangesSpec, number: u8, now: Instant) {
         for (watch, row) in self.rows.iter_mut().zip(&exchanges.rows).filter(|(_, row)| row.slave == number) {
             watch.starts |= row.kind == Kind::Start;
@@ -607,7 +609,7 @@ impl ExchangesWatch {
         self.slaves.entry(number).or_default().started = now;
     }
 
-    /// A deadline may have passed: replies that have not come fail.
+    /// Lets a request fail whose reply is overdue. Returns the slave if it has started.
     pub(super) fn tick(&mut self, exchanges: &ExchangesSpec, heard: Instant, now: Instant) -> Option<u8> {
         let flight = self.flight.as_ref()?;
         let spec = &exchanges.rows[flight.row];
@@ -618,7 +620,8 @@ impl ExchangesWatch {
         }
         let mut flight = self.flight.take()?;
         if flight.may_be_echo && !flight.is_wrong {
-            // Nobody knows. It is not a failure. What came may have been the echo, and the replies are still to come.
+            // Whether it was executed is unknown, and it has not failed: the frame may have been the echo, and all
+            // replies may still arrive.
             let until = flight.sent? + spec.late;
             self.rest(spec.pause, now);
             let watch = &mut self.rows[flight.row];
@@ -654,10 +657,10 @@ impl ExchangesWatch {
         self.repeat.as_ref().map(|failed| &failed.request[..])
     }
 
-    /// The request cannot be repeated. Returns the slave if it has started.
+    /// The gateway does not repeat the request. Returns the slave if it has started.
     pub(super) fn is_not_repeated(&mut self, exchanges: &ExchangesSpec, now: Instant) -> Option<u8> {
         let mut failed = self.repeat.take()?;
-        // It counts as repeated.
+        // It counts as repeated nevertheless.
         failed.repeated += 1;
         self.fails(exchanges, &failed, false, now)
     }
@@ -675,7 +678,7 @@ impl ExchangesWatch {
         let sent = flight.sent.unwrap_or(now);
         self.leaves_of(exchanges, flight, flight.repeated + 1, sent, now);
         if is_wrong {
-            // It said something, and nobody knows what.
+            // The slave sent something unreadable.
             return self.ended(exchanges, flight, Ended::Unclear, now);
         }
         let watch = &mut self.rows[flight.row];
@@ -692,8 +695,9 @@ impl ExchangesWatch {
         None
     }
 
-    /// Whether a slave is away: each of its exchanges that used to be answered, or two of them, failed since it was
-    /// heard; all of them count if none ever was. If one of those has a period, only those with one count.
+    /// Whether a slave is away: since it was last heard, each of its exchanges that used to be answered has failed, or
+    /// two of them. If none was ever answered, all count. If one of those that count is periodic, only the periodic
+    /// ones count.
     fn is_silent(&self, exchanges: &ExchangesSpec, number: u8) -> bool {
         let rows = exchanges.rows_of(number).filter(|(_, row)| row.is_answered());
         let rows: Vec<_> = rows.map(|(nth, row)| (row.every.is_some(), &self.rows[nth])).collect();
@@ -707,9 +711,9 @@ impl ExchangesWatch {
         missed > 0 && missed >= deciding.len().min(2)
     }
 
-    /// Checks that the line has not been idle although a period has ended, that every period has its turn,
-    /// and that slaves that are down are looked for. `stalled` is for how long the gateway was not called
-    /// since an instant. Returns the number of checks.
+    /// Checks that the line is not idle although a period has ended, that every period has its turn, and that slaves
+    /// that are away are probed. `stalled` returns for how long the gateway was not called since an instant. Returns
+    /// the number of checks.
     pub(super) fn keeps_periods(
         &self,
         port: &PortSpec,
@@ -725,7 +729,7 @@ impl ExchangesWatch {
                 continue;
             };
             let Some(slave) = self.slaves.get(&row.slave) else { continue };
-            // Nothing is known of a device that nobody expects an answer of.
+            // If no exchange with a device has a reply, its presence stays unknown.
             let is_mute = slave.presence == Presence::Unknown
                 && exchanges.rows_of(row.slave).all(|(_, row)| !row.is_answered());
             let is_healthy = slave.presence == Presence::Up && slave.failing.is_none();
@@ -747,7 +751,7 @@ impl ExchangesWatch {
                 return Err((Invariant::Periods, what));
             }
         }
-        // A request with values is not sent as long as one is unknown or stale.
+        // A request with values is not sent while one of them is unknown or stale.
         let is_asked = |row: &RowSpec| row.every.is_some() && row.is_always_ready() && row.is_answered();
         let is_wanted = |number: u8| exchanges.rows_of(number).any(|(_, row)| is_asked(row));
         let are_down = self.slaves.iter().filter(|(_, slave)| slave.presence == Presence::Down);
@@ -766,7 +770,7 @@ impl ExchangesWatch {
         Ok(checked)
     }
 
-    /// Whether something may have to come first at the start of a slave.
+    /// Whether a start exchange of a slave may have to be sent before its others.
     fn is_opening(&self, exchanges: &ExchangesSpec, number: u8, slave: &SlaveWatch) -> bool {
         let starts = |(nth, row): (usize, &RowSpec)| {
             let watch = &self.rows[nth];
@@ -777,7 +781,7 @@ impl ExchangesWatch {
             || exchanges.rows_of(number).any(starts)
     }
 
-    /// Since when the exchange could be executed without any failure on the line; `None` if it cannot.
+    /// Since when the exchange could be executed without a failure on the line; `None` if it cannot now.
     pub(super) fn could_ask(&self, exchanges: &ExchangesSpec, row: usize) -> Option<Instant> {
         let number = exchanges.rows[row].slave;
         let (slave, watch) = (self.slaves.get(&number)?, &self.rows[row]);
@@ -789,7 +793,7 @@ impl ExchangesWatch {
     }
 }
 
-/// How long a slave that does not answer, or an exchange, is not asked.
+/// The wait after this many failures of a slave or an exchange.
 fn wait(timeout: Duration, failures: u32) -> Duration {
     timeout.saturating_mul(1 << failures.min(6)).min(LONGEST_WAIT.max(timeout.saturating_mul(2)))
 }
@@ -804,7 +808,7 @@ impl Half for Duration {
     }
 }
 
-/// What the file says of own bytes.
+/// Whether the line echoes, as configured; `None` if the gateway finds out.
 fn known(echo: Echo) -> Option<bool> {
     match echo {
         Echo::Yes => Some(true),
@@ -813,7 +817,7 @@ fn known(echo: Echo) -> Option<bool> {
     }
 }
 
-/// The exchange in words.
+/// Names the exchange in messages.
 pub(super) fn name(row: &RowSpec) -> String {
     if row.frames.is_some() {
         return format!("exchange {} with device {}", row.nth + 1, row.slave);
@@ -821,7 +825,7 @@ pub(super) fn name(row: &RowSpec) -> String {
     format!("slave {}, function {} at {}", row.slave, row.function, row.address)
 }
 
-/// A free line with something to do is not left idle for longer.
+/// A free line is not idle for longer than this while a request is due.
 const IDLE: Duration = Duration::from_millis(5);
-/// A slave that does not answer is asked again after this at the latest, if the line has a gap.
+/// No wait of a slave or an exchange is longer than this, or than twice the timeout if that is more.
 const LONGEST_WAIT: Duration = Duration::from_secs(30);

@@ -1,5 +1,5 @@
-//! Exchanges with the slaves of a Modbus RTU line and with devices that have frames of their own: what
-//! the gateway asks and takes, and what devices and controller really had (docs/cell.md section 4).
+//! Judges the exchanges of a port with the slaves of a Modbus RTU line, or with devices that have frames of their own:
+//! what the gateway sends and accepts, and what devices and controller really had (docs/cell.md section 4).
 
 pub(super) mod line;
 pub(super) mod served;
@@ -26,11 +26,11 @@ use super::{Invariant, Oracle};
 use crate::SlaveDone;
 
 impl Oracle {
-    /// Bytes of a line came.
+    /// Bytes were received on a line.
     pub(super) fn exchange_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
         self.ports[nth].line.heard = now;
         let mut verdicts = Vec::new();
-        // One by one: a frame that is complete is taken before the next byte is looked at.
+        // One by one: a complete frame is taken before the next byte is interpreted.
         for &byte in bytes {
             self.ports[nth].line.held.push(byte);
             self.exchange_held(nth, &mut verdicts, now);
@@ -38,7 +38,7 @@ impl Oracle {
         self.take(nth, verdicts, now);
     }
 
-    /// Looks for frames in the bytes that are held.
+    /// Interprets the bytes received so far.
     fn exchange_held(&mut self, nth: usize, verdicts: &mut Vec<Verdict>, now: Instant) {
         loop {
             let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
@@ -98,7 +98,7 @@ impl Oracle {
         }
     }
 
-    /// A frame came on a bus.
+    /// A frame was received on a bus.
     pub(super) fn exchange_can(&mut self, nth: usize, frame: &CanFrame, now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let Some(exchanges) = &port.exchanges else { return };
@@ -153,14 +153,14 @@ impl Oracle {
         self.take_can(nth, verdict, now);
     }
 
-    /// The gateway knows that a slave has started.
+    /// The gateway has noticed that this slave has started, if any.
     fn started(&mut self, nth: usize, slave: Option<u8>) {
         if let Some(slave) = slave {
             self.truth.started(nth, slave);
         }
     }
 
-    /// A device has answered; returns what becomes of its values.
+    /// A device has answered. Returns the verdict on the values of its reply.
     fn answered(&mut self, nth: usize, reply: &[u8], ended: Ended, now: Instant) -> Option<Verdict> {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let exchanges = port.exchanges.as_ref()?;
@@ -183,7 +183,7 @@ impl Oracle {
         })
     }
 
-    /// The gateway asks.
+    /// The gateway sends a request.
     pub(super) fn exchange_send(
         &mut self,
         nth: usize,
@@ -206,7 +206,7 @@ impl Oracle {
             return Err((Invariant::Shown, format!("asked {bytes:02x?}, which no exchange asks")));
         };
         if exchanges.unasked.is_empty() {
-            // What is held is too old to be the reply.
+            // The bytes received so far are too old to belong to the reply.
             watch.line.discard();
         }
         let stalled = |since| robot.stalled_since(since, now);
@@ -219,7 +219,7 @@ impl Oracle {
         });
         watch.exchanges.note_sent(port, exchanges, (row, bytes), line, now)?;
         let asked = &exchanges.rows[row];
-        // What an event says was decided when it happened.
+        // The values of an event were fixed when it happened.
         if let Some(request) = asked.request.as_ref().filter(|_| asked.kind != Kind::Event) {
             let hidden = Downward::may_show_all(port, &self.up, asked.shown(), now);
             hidden.map_err(|hidden| hidden.wrong(&self.spec))?;
@@ -233,20 +233,20 @@ impl Oracle {
         Ok(())
     }
 
-    /// What was sent has left.
+    /// A transmission has left.
     pub(super) fn port_sent(&mut self, nth: usize, now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         watch.down.sent();
         if let Some(exchanges) = &port.exchanges {
             watch.exchanges.left(exchanges, port.turnaround, now);
             if watch.exchanges.waits() && !port.is_can {
-                // The line is the device's until it has answered.
+                // The line belongs to the device until it has replied.
                 watch.down.hold();
             }
         }
     }
 
-    /// Replies that have not come in time fail.
+    /// Lets requests fail whose replies are overdue.
     pub(super) fn exchange_tick(&mut self, nth: usize, now: Instant) {
         let Some(exchanges) = &self.spec.ports[nth].exchanges else { return };
         let watch = &mut self.ports[nth];
@@ -263,8 +263,8 @@ impl Oracle {
         }
     }
 
-    /// A request that is to be repeated has failed if its values cannot be shown any more, or have changed. Returns
-    /// whether it is given up.
+    /// Gives up a repetition whose values may no longer be sent, or have changed; an event is repeated with its values.
+    /// Returns whether it is given up.
     fn gives_up(&mut self, nth: usize, now: Instant) -> bool {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let Some((exchanges, failed)) = port.exchanges.as_ref().zip(watch.exchanges.repeats()) else {
@@ -286,7 +286,7 @@ impl Oracle {
         true
     }
 
-    /// The engine has nothing to do: checks that no repetition waits that could be sent.
+    /// Checks that an idle engine has no repetition waiting that could be sent.
     pub(super) fn exchange_rests(&mut self, nth: usize, now: Instant) -> Result<(), Wrong> {
         let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
         if watch.exchanges.repeats().is_none() {
@@ -302,7 +302,7 @@ impl Oracle {
         Ok(())
     }
 
-    /// A value may have changed: looks for bits that ask.
+    /// A value may have changed: checks the bits whose rise is an event.
     pub(super) fn exchange_values_changed(&mut self, now: Instant) {
         for (watch, port) in self.ports.iter_mut().zip(&self.spec.ports) {
             let Some(exchanges) = &port.exchanges else { continue };
@@ -317,7 +317,7 @@ impl Oracle {
         }
     }
 
-    /// A slave or a device that is asked did something.
+    /// A slave or a device with exchanges did something.
     pub(crate) fn slave_did(&mut self, port: usize, done: SlaveDone, now: Instant) {
         if self.violation.is_some() {
             return;
@@ -329,22 +329,22 @@ impl Oracle {
         self.judge(now, &[], result);
     }
 
-    /// Bytes were changed or lost on a line, or came from nobody's slave.
+    /// Bytes were corrupted or lost on a line, or were not sent by one of the simulated slaves.
     pub(crate) fn line_garbled(&mut self, port: usize, now: Instant) {
         self.truth.garbled(port, now);
     }
 
-    /// Whether [`Self::sees_controller`] is to be called.
+    /// Whether [`Self::sees_controller`] is needed.
     pub(crate) fn wants_controller(&self) -> bool {
         self.truth.wants_controller()
     }
 
-    /// The controller's variables as they are now.
+    /// Reports the current variables of the controller.
     pub(crate) fn sees_controller(&mut self, image: &[u8], now: Instant) {
         self.truth.sees_controller(image, now);
     }
 
-    /// Checks periods, and what slaves must have been sent. Called at intervals.
+    /// Checks the periods, and that slaves have the newest values. Called at intervals.
     pub(super) fn survey_exchanges(&mut self, now: Instant) {
         for nth in 0..self.ports.len() {
             let port = &self.spec.ports[nth];
@@ -384,7 +384,7 @@ impl Oracle {
     }
 }
 
-/// A frame came that nobody asked for: a sign of life if it is of an exchange.
+/// An unsolicited frame was received: a sign of life if it is also the reply of an exchange.
 fn heard_unasked(
     watch: &mut ExchangesWatch,
     exchanges: &ExchangesSpec,
@@ -402,11 +402,11 @@ fn agrees(down: &Downward, row: &RowSpec, request: &Frame, up: &Upward, bytes: &
     payload.is_some_and(|payload| down.agrees(request, up, payload))
 }
 
-/// Looks for exchanges that are to be asked at the start, and whose values cannot be shown.
+/// Notes the start exchanges that cannot be sent now because their values are unknown or stale.
 fn look_at_opening(watch: &mut ExchangesWatch, port: &PortSpec, can_ask: impl Fn(&RowSpec) -> bool) {
     let rows = port.exchanges.as_ref().map_or(&[][..], |exchanges: &ExchangesSpec| &exchanges.rows);
     watch.look_at_opening(|row| rows.get(row).is_some_and(&can_ask));
 }
 
-/// The controller's values are at a slave this long after they have come to rest, if everything works.
+/// If everything works, a slave has the controller's values this long after their last change.
 const SETTLE: Duration = Duration::from_millis(1_500);

@@ -1,5 +1,6 @@
-//! A port on which the gateway is a Modbus slave: what a master's requests lead to (proto-core/docs/wire/modbus-rtu.md
-//! section 6 and modbus.md sections 3 to 5, docs/configuration.md section 4, "Modbus RTU slave").
+//! A port on which the gateway is a Modbus slave: the effect and the reply of each request of a master
+//! (proto-core/docs/wire/modbus-rtu.md section 6 and modbus.md sections 3 to 5, docs/configuration.md section 4,
+//! "Modbus RTU slave").
 //!
 //! Written from these pages, independent of the engine's slave.
 
@@ -20,16 +21,16 @@ use crate::rtu::{is_right, sealed};
 #[derive(Debug, Clone, Default)]
 pub(in crate::oracle) struct ServedWatch {
     held: Vec<u8>,
-    /// More came without a silence than a slave can hold.
+    /// More bytes arrived without a silence than a slave can hold.
     too_many: bool,
     heard: Instant,
     /// A reply that has not been sent.
     kept: Option<Vec<u8>>,
-    /// What masters have written, by block.
+    /// The newest data that a master has written, by block.
     written: BTreeMap<usize, Vec<u8>>,
 }
 
-/// Why a request is refused.
+/// The exception code with which a request is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Exception(u8);
 
@@ -40,11 +41,11 @@ const FAILURE: Exception = Exception(4);
 
 impl ServedWatch {
     fn received(&mut self, spec: &ServedSpec, bytes: &[u8], now: Instant) {
-        // The line goes on: a reply that was not sent is too late.
+        // Other bytes follow, so a reply that has not been sent is too late.
         self.kept = None;
         let began = now - spec.line.time_on_line(bytes.len());
         if !self.held.is_empty() && began >= self.heard + spec.line.idle_gap {
-            // There was silence before these, so nobody waits for an answer to what came before.
+            // There was a silence before these bytes, so no master waits for the reply to earlier ones.
             self.held.clear();
             self.too_many = false;
         }
@@ -54,7 +55,7 @@ impl ServedWatch {
         self.held.truncate(MOST);
     }
 
-    /// What has begun is not continued. Returns the number of bytes.
+    /// Discards what was received, and the reply. Returns the number of bytes.
     pub(in crate::oracle) fn discard(&mut self) -> u64 {
         (self.kept, self.too_many) = (None, false);
         std::mem::take(&mut self.held).len() as u64
@@ -62,7 +63,7 @@ impl ServedWatch {
 }
 
 impl Oracle {
-    /// Bytes of a master came, or of other slaves.
+    /// Bytes of a master or of other slaves were received.
     pub(in crate::oracle) fn served_bytes(&mut self, nth: usize, bytes: &[u8], now: Instant) {
         let (port, watch) = (&self.spec.ports[nth], &mut self.ports[nth]);
         let Some(spec) = &port.served else { return };
@@ -73,7 +74,7 @@ impl Oracle {
         }
     }
 
-    /// A request may have ended.
+    /// If the line is silent, a transmission has ended: executes its requests.
     pub(in crate::oracle) fn served_tick(&mut self, nth: usize, now: Instant) {
         let Some(spec) = &self.spec.ports[nth].served else { return };
         let watch = &mut self.ports[nth].served;
@@ -98,7 +99,7 @@ impl Oracle {
             match frame[0] {
                 0 if matches!(pdu[0], 5 | 6 | 15 | 16 | 22) => drop(self.execute(nth, pdu, now)),
                 address if address == own => {
-                    // Behind an earlier request, its master no longer waits.
+                    // The master of an earlier request no longer waits for the reply.
                     if at == burst.frames.len() && burst.rest.is_empty() && !too_many {
                         reply = Some((pdu[0], self.execute(nth, pdu, now)));
                     }
@@ -120,7 +121,7 @@ impl Oracle {
         });
     }
 
-    /// Executes a request; returns what answers it.
+    /// Executes a request and returns its reply.
     fn execute(&mut self, nth: usize, pdu: &[u8], now: Instant) -> Result<Vec<u8>, Exception> {
         let function = pdu[0];
         let word = |at: usize| Some(u16::from_be_bytes([*pdu.get(at)?, *pdu.get(at + 1)?]));
@@ -201,7 +202,7 @@ impl Oracle {
         Ok(out)
     }
 
-    /// What a block shows now.
+    /// The current data of a block.
     fn data_of(&self, nth: usize, place: usize, block: &Block, now: Instant) -> Result<Vec<u8>, Exception> {
         let (port, watch) = (&self.spec.ports[nth], &self.ports[nth]);
         let Some(output) = &block.output else {
@@ -226,7 +227,7 @@ impl Oracle {
         let found = spec.blocks.iter().enumerate().find(|(_, block)| is_it(block) && block.input.is_some());
         let (place, frame) = found.and_then(|(at, block)| Some((at, block.input?))).ok_or(ADDRESS)?;
         if let (Table::Coils, Some(last), left @ 1..) = (table, data.last_mut(), count % 8) {
-            // Bits beyond the last coil mean nothing.
+            // Bits after the last coil have no meaning.
             *last &= (1 << left) - 1;
         }
         let verdict = self.ports[nth].line.judge_block(&port.inputs[frame], frame, &data);
@@ -280,7 +281,7 @@ impl Oracle {
     }
 }
 
-/// What was between two silences: frames with a right CRC, and what follows the last of them.
+/// A transmission between two silences: frames with a valid CRC, and the bytes after the last of them.
 #[derive(Debug)]
 struct Burst<'a> {
     frames: Vec<&'a [u8]>,
@@ -288,7 +289,7 @@ struct Burst<'a> {
 }
 
 impl<'a> Burst<'a> {
-    /// `is_bare`: the byte before it was dropped.
+    /// `is_bare`: the byte before these was dropped.
     fn read(bytes: &'a [u8], own: u8, is_bare: bool) -> Self {
         let (mut frames, mut rest) = (Vec::new(), bytes);
         while let Some((len, is_request)) = first_frame(rest, own, is_bare) {
@@ -305,8 +306,8 @@ impl<'a> Burst<'a> {
     }
 }
 
-/// The length of the frame at the front of `bytes`, and whether it is as long as a request: what the function
-/// says of a request or a reply, or all of them.
+/// The length of the valid frame at the front of `bytes`, and whether a request has this length. Possible lengths are
+/// those of a request and a reply with this function code, and that of all bytes.
 fn first_frame(bytes: &[u8], own: u8, is_bare: bool) -> Option<(usize, bool)> {
     let counted = |at: usize, more: usize| bytes.get(at).map(|&count| usize::from(count) + more);
     let (request, reply) = match bytes.get(1)? {
@@ -331,5 +332,5 @@ fn first_frame(bytes: &[u8], own: u8, is_bare: bool) -> Option<(usize, bool)> {
     Some((len, Some(len) == request))
 }
 
-/// Two of the longest frames.
+/// Bytes that a slave can hold: two frames of the maximum length.
 const MOST: usize = 512;

@@ -1,7 +1,7 @@
-//! What slaves and controller really had, whatever the gateway thinks: the other half of each value's way.
+//! The values that slaves and controller really had, whatever the gateway believes: both ends of the way of each value.
 //!
-//! In: what the slaves of a line did, the controller's registers at each step, what the gateway asked and
-//! took. Out: violations. Knows nothing of timeouts and repetitions.
+//! In: what the slaves of a line did, the controller's registers at each step, the requests that the gateway sent and
+//! the replies that it accepted. Out: violations. Does not know timeouts or repetitions.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::ops::Range;
@@ -22,24 +22,24 @@ use crate::oracle::spec::{Origin, PortSpec, Spec};
 use crate::oracle::varying::look;
 use crate::{Done, SlaveDone};
 
-/// Slaves and controller.
+/// The slaves of all lines, and the controller.
 #[derive(Debug, Clone, Default)]
 pub(in crate::oracle) struct Truth {
     lines: BTreeMap<usize, LineTruth>,
-    /// The variables that slaves are sent, by ordinal.
+    /// The variables that are sent to slaves, by ordinal.
     histories: Vec<History>,
-    /// The part of the controller's image that has them, when it was last looked at.
+    /// The part of the controller's image with these variables, as last seen.
     seen: Vec<u8>,
     seen_from: usize,
 }
 
-/// The values that a variable had which slaves are sent.
+/// The values that the controller had of a variable that is sent to slaves.
 #[derive(Debug, Clone)]
 struct History {
     var: SysVar,
     /// Its place in the controller's image.
     place: Range<usize>,
-    /// The values that the controller had, each with when it came.
+    /// Each value, with the time since which the controller had it.
     had: VecDeque<(Instant, Raw)>,
 }
 
@@ -47,17 +47,17 @@ struct History {
 #[derive(Debug, Clone, Default)]
 struct LineTruth {
     answers: VecDeque<Answer>,
-    /// Requests of the gateway that write, and which slaves have executed them.
+    /// Requests that write, as sent by the gateway, and the slaves that have executed them.
     requests: VecDeque<(Instant, usize, Vec<u16>, BTreeSet<u8>)>,
-    /// The newest request of each exchange that a device took, of frames of its own.
+    /// For devices with frames of their own: the newest request of each exchange that the device has accepted.
     took: BTreeMap<usize, Vec<u8>>,
-    /// What was written to each slave: coils or registers, and where.
+    /// What was written to the slaves, by slave, coils or registers, and address.
     memory: BTreeMap<(u8, bool, u16), u16>,
-    /// Slaves that have forgotten what was written, of which the gateway does not know that.
+    /// Slaves that have forgotten what was written, and of which the gateway does not know it.
     forgot: BTreeSet<u8>,
     /// The values that each variable had at its slave.
     held: BTreeMap<usize, VecDeque<(Instant, Raw)>>,
-    /// When bytes were last changed on the line, or sent by nobody's slave.
+    /// When bytes were last corrupted on the line, or were not sent by one of the simulated slaves.
     garbled: Option<Instant>,
 }
 
@@ -90,14 +90,14 @@ impl Truth {
         Self { lines: BTreeMap::new(), histories, seen: Vec::new(), seen_from }
     }
 
-    /// Whether the controller's registers are needed.
+    /// Whether [`Self::sees_controller`] is needed.
     pub(in crate::oracle) fn wants_controller(&self) -> bool {
         !self.histories.is_empty()
     }
 
-    /// The controller's variables as they are now.
+    /// Reports the current variables of the controller.
     pub(in crate::oracle) fn sees_controller(&mut self, image: &[u8], now: Instant) {
-        // Most steps of a cell change nothing of it.
+        // Most steps of a cell do not change them.
         if !self.seen.is_empty() && image[self.seen_from..].starts_with(&self.seen) {
             return;
         }
@@ -113,7 +113,7 @@ impl Truth {
         }
     }
 
-    /// Forgets values that the controller had too long ago.
+    /// Forgets values of the controller that are too old to matter.
     pub(in crate::oracle) fn forget_old(&mut self, now: Instant) {
         for History { had, .. } in &mut self.histories {
             while had.len() > 1 && now.saturating_since(had[1].0) > REMEMBERED {
@@ -122,7 +122,7 @@ impl Truth {
         }
     }
 
-    /// The values that the controller had.
+    /// The values that the controller had of a variable.
     pub(super) fn had(&self, var: SysVar) -> Option<&VecDeque<(Instant, Raw)>> {
         let nth = self.histories.binary_search_by_key(&var.ordinal(), |history| history.var.ordinal());
         nth.ok().map(|nth| &self.histories[nth].had).filter(|had| !had.is_empty())
@@ -139,7 +139,7 @@ impl Truth {
         }
     }
 
-    /// The gateway asks.
+    /// The gateway sends a request.
     pub(super) fn asks(&mut self, port: usize, row: usize, spec: &RowSpec, request: &[u8], now: Instant) {
         if !spec.is_written() {
             return;
@@ -152,13 +152,13 @@ impl Truth {
         }
     }
 
-    /// Whether something happened on the line that a CRC may not show.
+    /// Whether a frame since then may be corrupted although its CRC is valid.
     fn is_excused(&self, port: usize, since: Instant) -> bool {
         let line = self.lines.get(&port);
         line.and_then(|line| line.garbled).is_some_and(|at| at + GARBLED >= since)
     }
 
-    /// A slave did something. Returns which invariants were looked at.
+    /// A slave did something. Returns the number of checks, and their result.
     pub(super) fn done(
         &mut self,
         spec: &Spec,
@@ -238,8 +238,8 @@ impl Truth {
         }
     }
 
-    /// A slave has executed a write of one of these exchanges: the gateway must have asked for it just
-    /// now, with values that the controller had together, and not long ago.
+    /// A slave has executed a write of one of these exchanges: the gateway must have sent the request just now, and the
+    /// controller must have had its values at the same time, recently.
     fn wrote(
         &mut self,
         spec: &Spec,
@@ -253,7 +253,7 @@ impl Truth {
         let line = self.lines.entry(nth).or_default();
         let is_it = |(at, row, asked, by): &&mut (Instant, usize, Vec<u16>, BTreeSet<u8>)| {
             let row = &exchanges.rows[*row];
-            // The other bits of a register are what its slave had.
+            // The slave had the other bits of a register before.
             let is_asked = asked.len() == values.len()
                 && asked.iter().zip(values).all(|(asked, value)| *asked == value & row.mask);
             let is_to_it = row.slave == slave || row.slave == 0;
@@ -270,7 +270,7 @@ impl Truth {
         self.were_had(spec, &spec.ports[nth], row, values, at, stalled(at))
     }
 
-    /// Checks that the controller had the values of a request together, at most as long before it as is promised.
+    /// Checks that the controller had the values of a request at the same time, no longer before it than promised.
     fn were_had(
         &self,
         spec: &Spec,
@@ -284,10 +284,10 @@ impl Truth {
             return Ok(());
         }
         let data = row.data_from(values);
-        // Without a limit, a value must have been there at any time that is remembered.
+        // Without a limit, the controller may have had a value at any time that is remembered.
         let lag = match port.stops_when_stale {
             true => {
-                // An event has the values of the moment at which it happened.
+                // The values of an event are those of the moment at which it happened.
                 let waited = if row.kind == Kind::Event { row.trigger } else { Duration::ZERO };
                 port.stale_after + way_of(spec, row) + waited + stalled.min(STALL) + STALL
             }
@@ -321,7 +321,7 @@ impl Truth {
         Ok(())
     }
 
-    /// When the controller had values of a variable for which `is_it` is true.
+    /// The periods in which the controller had values of a variable for which `is_it` is true.
     fn spans(&self, var: SysVar, now: Instant, is_it: impl Fn(Raw) -> bool) -> Vec<(Instant, Instant)> {
         let Some(had) = self.had(var) else { return Vec::new() };
         let ends = had.iter().skip(1).map(|(at, _)| *at).chain([now.max(Instant::ZERO)]);
@@ -329,7 +329,7 @@ impl Truth {
         spans.map(|((since, _), until)| (*since, until)).collect()
     }
 
-    /// The gateway has taken a reply: its slave must have made it, for this question, since it was asked.
+    /// The gateway has accepted a reply: its slave must have sent it for this request, after the first transmission.
     pub(super) fn taken(
         &mut self,
         port: (usize, &PortSpec),
@@ -364,7 +364,7 @@ impl Truth {
         Err((Invariant::Held, what))
     }
 
-    /// A value of a slave reaches the controller: the slave must have held it since then.
+    /// A value of a slave reaches the controller: the slave must have had it at `since` or later.
     pub(in crate::oracle) fn was_held(
         &self,
         port: usize,
@@ -385,8 +385,8 @@ impl Truth {
         Err((Invariant::Held, what))
     }
 
-    /// Checks that a slave has the controller's values, if they have been the same since before `since`.
-    /// `None` if they have not, or nobody can know.
+    /// Checks that a slave has the controller's values, if these have not changed after `since`. `None` if they have
+    /// changed, or if the slave's values are unknown.
     pub(super) fn is_up_to_date(
         &self,
         port: usize,
@@ -421,7 +421,7 @@ impl Truth {
         Some(wrong.map_or(Ok(()), |what| Err((Invariant::Updated, what))))
     }
 
-    /// Size of what is kept.
+    /// Number of stored entries.
     pub(in crate::oracle) fn len(&self) -> usize {
         let of_line = |line: &LineTruth| {
             line.answers.len() + line.requests.len() + line.held.values().map(VecDeque::len).sum::<usize>()
@@ -432,7 +432,7 @@ impl Truth {
 }
 
 impl LineTruth {
-    /// What a slave has of an exchange that writes, as data of a request.
+    /// The data of a writing exchange that its slave has, in the form of a request.
     fn written(&self, row: &RowSpec) -> Option<Vec<u8>> {
         let address = row.written?;
         let there =
@@ -444,7 +444,7 @@ impl LineTruth {
     }
 }
 
-/// The fields of a request and their places in its data.
+/// The fields of a request, each with its place in the data.
 fn fields(row: &RowSpec) -> Vec<(&FieldSpec, std::ops::Range<usize>)> {
     let Some(request) = &row.request else { return Vec::new() };
     match &request.device {
@@ -461,7 +461,7 @@ fn fields(row: &RowSpec) -> Vec<(&FieldSpec, std::ops::Range<usize>)> {
     }
 }
 
-/// Whether a field with these bytes shows this value of its variable.
+/// Whether these bytes of a field are what this value of its variable is sent as.
 fn agrees(field: &FieldSpec, var: SysVar, raw: Raw, bytes: &[u8]) -> bool {
     let (encoding, overflow, from) = match *field {
         FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
@@ -484,10 +484,10 @@ fn agrees(field: &FieldSpec, var: SysVar, raw: Raw, bytes: &[u8]) -> bool {
     device::read(&encoding, bytes) == Some(device::shown_as(&encoding, overflow, number))
 }
 
-/// The values of variables in a reply; none in a refusal.
+/// The values of the variables in a reply; none in a refusal.
 fn values_of(port: &PortSpec, row: &RowSpec, reply: &[u8]) -> Vec<(SysVar, Raw)> {
     let Some(nth) = row.reply else { return Vec::new() };
-    // Alive counters do not matter here: the device knows what it had.
+    // Alive counters do not matter here: the device knows which values it had.
     let (frame, mut apart) = (&port.inputs[nth], LineWatch::default());
     let verdict = match row.frames {
         Some(_) if look(frame, reply) == Look::Frame(reply.len()) => apart.judge(frame, nth, reply),
@@ -502,13 +502,13 @@ fn values_of(port: &PortSpec, row: &RowSpec, reply: &[u8]) -> Vec<(SysVar, Raw)>
     }
 }
 
-/// How long a value is on its way from the controller to the gateway at most.
+/// The longest time that a value takes from the controller to the gateway.
 fn way_of(spec: &Spec, row: &RowSpec) -> Duration {
     let is_polled = row.shown().all(|var| spec.origin[var.ordinal()] == Some(Origin::Modbus));
     if is_polled { POLLED } else { STREAMED }
 }
 
-/// Whether one poll brings all values of a request.
+/// Whether the gateway reads all values of a request with one poll.
 fn come_together(spec: &Spec, row: &RowSpec) -> bool {
     let places: Option<Vec<u16>> = row
         .shown()
@@ -527,13 +527,13 @@ fn come_together(spec: &Spec, row: &RowSpec) -> bool {
 const ON_THE_LINE: Duration = Duration::from_millis(250);
 /// A poll is given up after this time.
 const POLLED: Duration = Duration::from_millis(500);
-/// More than data of a stream can be late.
+/// More than the delay of data in a stream.
 const STREAMED: Duration = Duration::from_secs(10);
-/// A longer stall of the gateway is sleep.
+/// A longer stall of the gateway counts as sleep.
 const STALL: Duration = Duration::from_millis(500);
-/// Registers that are at most this far apart come with one poll.
+/// Registers that are at most this far apart are read with one poll.
 const TOGETHER: u16 = 16;
-/// For so long after bytes were changed on a line, what looks right may be wrong.
+/// For this long after bytes were corrupted on a line, a frame that looks valid may be wrong.
 const GARBLED: Duration = Duration::from_secs(1);
 /// For how long values are remembered.
 const REMEMBERED: Duration = Duration::from_secs(60);
