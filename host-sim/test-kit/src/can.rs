@@ -1,13 +1,13 @@
-//! CAN interfaces of the kernel, and can-utils on them.
+//! CAN interfaces of the kernel, and the can-utils on them.
 
 use std::process::{Command, Stdio};
 
 use super::{Process, until};
 
-/// Runs a tool to its end and returns its stdout.
+/// Runs a tool until it ends and returns its stdout.
 ///
 /// # Panics
-/// If that fails.
+/// If the tool cannot be run or fails.
 #[track_caller]
 pub fn tool(command: &str) -> String {
     let mut words = command.split_whitespace();
@@ -22,7 +22,7 @@ pub fn tool(command: &str) -> String {
 /// Sends a frame such as `001#0102`.
 ///
 /// # Panics
-/// If that fails.
+/// If it cannot be sent.
 #[track_caller]
 pub fn cansend(interface: &str, frame: &str) {
     tool(&format!("cansend {interface} {frame}"));
@@ -33,10 +33,10 @@ pub fn cansend(interface: &str, frame: &str) {
 pub struct Candump(Process);
 
 impl Candump {
-    /// Starts it and waits until it receives frames.
+    /// Starts `candump` and waits until it receives frames.
     ///
     /// # Panics
-    /// If that fails.
+    /// If it does not start.
     #[track_caller]
     pub fn start(interface: &str) -> Self {
         let mut command = Command::new("stdbuf");
@@ -60,25 +60,25 @@ impl Candump {
         self.log().iter().filter_map(|line| line.split_whitespace().nth(2)).map(str::to_owned).collect()
     }
 
-    /// Waits until the frame was on the bus.
+    /// Waits until the frame has been on the bus.
     ///
     /// # Panics
-    /// If that fails.
+    /// If it does not appear in time.
     #[track_caller]
     pub fn wait_for(&self, frame: &str) {
         until(frame, || self.frames().iter().any(|seen| seen == frame).then_some(()));
     }
 }
 
-/// An interface that exists for one test.
+/// A virtual interface that exists for one test.
 #[derive(Debug)]
 pub struct Vcan(pub &'static str);
 
 impl Vcan {
-    /// Makes a virtual interface and brings it up.
+    /// Creates the interface and brings it up.
     ///
     /// # Panics
-    /// If that fails.
+    /// If that fails, for example without the required privileges.
     #[track_caller]
     pub fn new(name: &'static str) -> Self {
         let _ = Command::new("ip").args(["link", "del", name]).stderr(Stdio::null()).status();

@@ -4,10 +4,10 @@ use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 
-/// Asks the emulator on its socket; its answer.
+/// Sends a request to the emulator's socket and returns its reply.
 ///
 /// # Panics
-/// If it does not answer.
+/// If it does not reply.
 #[track_caller]
 pub fn request(socket: &Path, words: &str) -> String {
     let mut stream = UnixStream::connect(socket).unwrap();
@@ -17,10 +17,10 @@ pub fn request(socket: &Path, words: &str) -> String {
     answer.trim_end().to_owned()
 }
 
-/// Tells the emulator what to do.
+/// Sends a command to the emulator's socket.
 ///
 /// # Panics
-/// If it does not do it.
+/// If its reply is not `done`.
 #[track_caller]
 pub fn command(socket: &Path, words: &str) {
     assert_eq!(request(socket, words), "done", "{words}");

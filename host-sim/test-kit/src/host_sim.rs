@@ -19,20 +19,20 @@ pub fn free_servers() -> [String; 4] {
     SERVERS.map(|server| format!("--set=listen.{server}=0"))
 }
 
-/// Path of the program: `Binary(env!("CARGO_BIN_EXE_host-sim"))`, which Cargo sets only for tests of its
-/// package.
+/// Path of the program: `Binary(env!("CARGO_BIN_EXE_host-sim"))`. Cargo sets this variable only for tests of the
+/// program's package.
 #[derive(Debug, Clone, Copy)]
 pub struct Binary(pub &'static str);
 
 impl Binary {
-    /// A command that runs it: no stdin, stdout and stderr piped.
+    /// A command that runs the program without stdin, with stdout and stderr piped.
     pub fn command(self) -> Command {
         let mut command = Command::new(self.0);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
 
-    /// `host-sim KIND -c FILE` with statistics each 50 ms.
+    /// `host-sim KIND -c FILE` with statistics every 50 ms.
     pub fn run(self, kind: &str, file: &Path) -> Command {
         let mut command = self.command();
         command.args([kind, "--stats", "50ms", "-c"]).arg(file);
@@ -51,7 +51,7 @@ impl Binary {
     /// A gateway that is connected to this controller, with all links up.
     ///
     /// # Panics
-    /// If they are not up in time.
+    /// If the links are not up in time.
     #[track_caller]
     pub fn gateway(self, file: &Path, robot: &HostSim, extra: &[&str]) -> HostSim {
         let links = robot.links(&["command", "state", "modbus"]);
@@ -66,7 +66,7 @@ impl Binary {
 /// Sends a command to a controller's port 2000, at `address`, and checks the reply.
 ///
 /// # Panics
-/// If the reply is another, or there is none.
+/// If there is no reply, or another one.
 #[track_caller]
 pub fn command(address: SocketAddr, request: &str, reply: &str) {
     let mut stream = TcpStream::connect(address).unwrap();
@@ -98,7 +98,7 @@ impl HostSim {
         Self { ready: serde_json::from_str(json).unwrap(), process }
     }
 
-    /// Same, if nobody reads its output; `file` is its ready file.
+    /// As [`Self::start`], without reading the output; `file` is the program's ready file.
     ///
     /// # Panics
     /// If it is not ready in time.
@@ -122,7 +122,7 @@ impl HostSim {
         place.unwrap_or_else(|| panic!("{name} is nowhere: {}", self.ready)).parse().unwrap()
     }
 
-    /// Arguments that make these links of a gateway use this controller.
+    /// Arguments that connect these links of a gateway to this controller.
     ///
     /// # Panics
     /// If it has no such server.
@@ -132,7 +132,7 @@ impl HostSim {
         names.iter().map(link).collect()
     }
 
-    /// The lines of its log so far that contain `words`.
+    /// The log lines so far that contain `words`.
     pub fn log(&self, words: &str) -> Vec<String> {
         self.errors().iter().filter(|line| line.contains(words)).cloned().collect()
     }
@@ -140,13 +140,13 @@ impl HostSim {
     /// Sends a command to this controller's port 2000 and checks the reply.
     ///
     /// # Panics
-    /// If the reply is another, or there is none.
+    /// If there is no reply, or another one.
     #[track_caller]
     pub fn command(&self, request: &str, reply: &str) {
         command(self.at("command"), request, reply);
     }
 
-    /// Ends it by SIGINT, as Ctrl-C does.
+    /// Ends it with SIGINT, as Ctrl-C does.
     ///
     /// # Panics
     /// If the exit code is not 0.
@@ -155,7 +155,7 @@ impl HostSim {
         self.ended_by(Signal::INT);
     }
 
-    /// Ends it by a signal.
+    /// Ends it with a signal.
     ///
     /// # Panics
     /// If the exit code is not 0.

@@ -1,4 +1,4 @@
-//! A client of the API: one request a connection, signed as over a network.
+//! A client of the API: one request per connection, signed as over a network.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -15,14 +15,14 @@ pub struct Response {
     pub status: u16,
     /// Status line and fields.
     pub head: String,
-    /// The body, without the frames of its chunks.
+    /// The body, with its chunks joined.
     pub body: Vec<u8>,
-    /// Whether the body ended where its head, or its last chunk, says.
+    /// Whether the body has the announced length, or ends with the last chunk.
     pub is_whole: bool,
 }
 
 impl Response {
-    /// Reads what a server has sent; `None` if there is no head.
+    /// Parses what a server has sent; `None` if the head is incomplete or invalid.
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let end = bytes.windows(4).position(|four| four == b"\r\n\r\n")?;
         let head = String::from_utf8(bytes[..end].to_vec()).ok()?;
@@ -36,7 +36,7 @@ impl Response {
         Some(response)
     }
 
-    /// Takes the chunks out of their frames; `None` if the last one is missing.
+    /// Joins the chunks of the body; `None` if the last one is missing.
     fn join_chunks(&mut self) -> Option<()> {
         let framed = std::mem::take(&mut self.body);
         let mut rest = &framed[..];
@@ -61,7 +61,7 @@ impl Response {
     /// The body as text.
     ///
     /// # Panics
-    /// If it is none.
+    /// If it is not UTF-8.
     #[track_caller]
     pub fn text(&self) -> &str {
         str::from_utf8(&self.body).unwrap()
@@ -70,16 +70,16 @@ impl Response {
     /// The body as JSON.
     ///
     /// # Panics
-    /// If it is none.
+    /// If it is not JSON.
     #[track_caller]
     pub fn json(&self) -> Value {
         serde_json::from_slice(&self.body).unwrap_or_else(|error| panic!("{error}: {}", self.text()))
     }
 
-    /// The same, if it is whole and has this status.
+    /// Returns the response if it is complete and has this status.
     ///
     /// # Panics
-    /// If it is or has not.
+    /// If it is incomplete or has another status.
     #[track_caller]
     pub fn must_be(self, status: u16) -> Self {
         assert!(
@@ -95,23 +95,23 @@ impl Response {
 /// A client of one server.
 #[derive(Debug, Clone)]
 pub struct Client {
-    /// Where it is reached.
+    /// The server's address.
     pub to: SocketAddr,
-    /// What it is called there.
+    /// The value of the `Host` field.
     pub host: String,
-    /// The key; without one nothing is signed.
+    /// The key; `None` to sign nothing.
     pub key: Option<Key>,
 }
 
 impl Client {
-    /// Sends bytes and returns what comes until the end; fewer if the connection is reset.
+    /// Sends bytes and returns everything received until the end of the connection, or until it is reset.
     ///
     /// # Errors
-    /// There is no connection.
+    /// The connection cannot be opened.
     pub fn exchange(&self, bytes: &[u8]) -> std::io::Result<Vec<u8>> {
         let mut stream = TcpStream::connect(self.to)?;
         stream.set_read_timeout(Some(PATIENCE))?;
-        // The server may have refused it before its end.
+        // The server may close the connection before it has read everything.
         let _ = stream.write_all(bytes);
         let mut answer = Vec::new();
         let mut chunk = [0; 4096];
@@ -121,15 +121,15 @@ impl Client {
         Ok(answer)
     }
 
-    /// A connection that holds little of what is not read, so that the server notices soon.
+    /// Opens a connection with a small receive buffer, so that the server soon notices a client that does not read.
     ///
     /// # Errors
-    /// There is none.
+    /// The connection cannot be opened.
     pub fn narrow_connection(&self) -> std::io::Result<TcpStream> {
         use rustix::net::{AddressFamily, SocketType, connect, socket, sockopt};
         let family = if self.to.is_ipv4() { AddressFamily::INET } else { AddressFamily::INET6 };
         let socket = socket(family, SocketType::STREAM, None)?;
-        // Before connecting, or a larger window was announced.
+        // Set before connecting, because the size of the window is announced then.
         sockopt::set_socket_recv_buffer_size(&socket, 4096)?;
         connect(&socket, &self.to)?;
         Ok(socket.into())
@@ -144,34 +144,34 @@ impl Client {
         [head.as_bytes(), body].concat()
     }
 
-    /// An unsigned request; `None` if there is no whole head in the answer.
+    /// Sends an unsigned request; `None` if the response has no complete head.
     pub fn try_request(&self, line: &str, fields: &str, body: &[u8]) -> Option<Response> {
         Response::parse(&self.exchange(&self.bytes(line, fields, body)).ok()?)
     }
 
-    /// An unsigned request.
+    /// Sends an unsigned request.
     ///
     /// # Panics
-    /// If it is not answered.
+    /// If there is no response.
     #[track_caller]
     pub fn request(&self, line: &str, fields: &str, body: &[u8]) -> Response {
         self.try_request(line, fields, body).unwrap_or_else(|| panic!("{line} was not answered"))
     }
 
-    /// A fresh nonce.
+    /// Requests a fresh nonce.
     ///
     /// # Panics
-    /// If there is none.
+    /// If the server returns none.
     #[track_caller]
     pub fn nonce(&self) -> String {
         let answer = self.request("GET /api/v1/nonce", "", b"").must_be(200).json();
         answer["nonce"].as_str().unwrap().to_owned()
     }
 
-    /// The field that signs a request with the client's key, or with one that is wrong if it has none.
+    /// The `Authorization` field of a request, signed with the client's key, or with a wrong key if it has none.
     ///
     /// # Panics
-    /// If `line` is no request line.
+    /// If `line` is not a request line.
     pub fn signature(&self, nonce: &str, line: &str, body: &[u8]) -> String {
         let (method, target) = line.split_once(' ').unwrap();
         let mut hash = BodyHash::new();
@@ -182,26 +182,26 @@ impl Client {
         format!("Authorization: {SCHEME} nonce={nonce}, body={body}, mac={}", Hex(&mac))
     }
 
-    /// A signed request.
+    /// Sends a signed request.
     ///
     /// # Panics
-    /// If it is not answered.
+    /// If there is no response.
     #[track_caller]
     pub fn signed(&self, line: &str, fields: &str, body: &[u8]) -> Response {
         let signature = self.signature(&self.nonce(), line, body);
         self.request(line, &format!("{signature}\n{fields}"), body)
     }
 
-    /// Reads, signed.
+    /// Sends a signed `GET`.
     ///
     /// # Panics
-    /// If it is not answered.
+    /// If there is no response.
     #[track_caller]
     pub fn get(&self, path: &str) -> Response {
         self.signed(&format!("GET /api/v1/{path}"), "", b"")
     }
 
-    /// Reads, signed; `None` if there is no place for it at the moment, as a board has few, or the key is not its.
+    /// Sends a signed `GET`; `None` unless it succeeds. A board may have no free connection, or refuse the key.
     pub fn try_get(&self, path: &str) -> Option<Response> {
         let nonce = self.try_request("GET /api/v1/nonce", "", b"")?.json();
         let line = format!("GET /api/v1/{path}");
@@ -209,10 +209,10 @@ impl Client {
         self.try_request(&line, &signature, b"").filter(|answer| answer.status == 200)
     }
 
-    /// Changes something, signed.
+    /// Sends a signed `POST` with a JSON body.
     ///
     /// # Panics
-    /// If it is not answered.
+    /// If there is no response.
     #[track_caller]
     pub fn post(&self, path: &str, body: &str) -> Response {
         self.signed(&format!("POST /api/v1/{path}"), "Content-Type: application/json", body.as_bytes())

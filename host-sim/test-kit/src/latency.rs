@@ -1,9 +1,9 @@
-//! Histograms of a status or of statistics.
+//! Latency histograms in a status or in statistics.
 
 use serde_json::Value;
 
-/// What a histogram grew by between two documents that have it as `latency.NAME`: the number of samples, and the
-/// buckets that hold the median, 99 % and the longest.
+/// The samples that were added to a histogram, `latency.NAME`, between two documents: their number, and the buckets of
+/// their median, 99th percentile and maximum.
 ///
 /// # Panics
 /// If one of them has no such histogram.

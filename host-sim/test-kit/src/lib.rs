@@ -1,7 +1,7 @@
 //! Helpers that the tests of host-sim's crates share: processes, waiting, files, configurations, sources.
 //!
-//! A helper panics if what the test needs does not happen. None of them depends on the simulated controller,
-//! on cells or on the shell, so that every crate can use them.
+//! A helper panics if what the test needs does not happen. None of them depends on the simulated controller, on cells
+//! or on the runtime, so that every crate can use them.
 
 pub mod can;
 pub mod chip;
@@ -38,11 +38,11 @@ pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Calls `count` repeatedly until it returns `wanted` or more. It may take long, as something emulated does on a busy
-/// machine, as long as it grows.
+/// Calls `count` repeatedly until it returns `wanted` or more. There is no limit for the whole time while the count
+/// grows, because an emulator can be slow on a busy machine.
 ///
 /// # Panics
-/// If it has not grown for [`PATIENCE`].
+/// If the count has not grown for [`PATIENCE`].
 #[track_caller]
 pub fn until_grown(what: &str, wanted: u64, mut count: impl FnMut() -> u64) {
     let mut reached = None;

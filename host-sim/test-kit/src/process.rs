@@ -22,10 +22,10 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts it. Stdout and stderr are read continuously, if they are piped.
+    /// Starts the process. Stdout and stderr are read continuously if they are piped.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// If it cannot be started.
     #[track_caller]
     pub fn start(command: &mut Command) -> Self {
         let mut process = Self::unread(command);
@@ -34,10 +34,10 @@ impl Process {
         process
     }
 
-    /// Same, without reading its output.
+    /// As [`Self::start`], without reading the output.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// If it cannot be started.
     #[track_caller]
     pub fn unread(command: &mut Command) -> Self {
         let child = command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
@@ -68,14 +68,14 @@ impl Process {
     /// The next line of stdout.
     ///
     /// # Panics
-    /// If none comes.
+    /// If there is none in time.
     #[track_caller]
     pub fn line(&self) -> String {
         let next = self.taken.fetch_add(1, Relaxed);
         until("a line on stdout", || self.lines().get(next).cloned())
     }
 
-    /// Skips the lines that have come so far: [`Self::line`] returns a later one.
+    /// Skips the lines so far: [`Self::line`] then returns a later one.
     pub fn skip_lines(&self) {
         self.taken.store(self.lines().len(), Relaxed);
     }
@@ -83,7 +83,7 @@ impl Process {
     /// Reads statistics line by line until some satisfy `found`.
     ///
     /// # Panics
-    /// If none do.
+    /// If none do in time.
     #[track_caller]
     pub fn next_stats(&self, found: impl Fn(&Value) -> bool) -> Value {
         let deadline = Instant::now() + PATIENCE;
@@ -104,7 +104,7 @@ impl Process {
     /// The newest statistics, once they satisfy `found`.
     ///
     /// # Panics
-    /// If they never do.
+    /// If they do not in time.
     #[track_caller]
     pub fn stats(&self, what: &str, found: impl Fn(&Value) -> bool) -> Value {
         let deadline = Instant::now() + PATIENCE;
@@ -121,11 +121,11 @@ impl Process {
     /// Statistics that were collected after this call.
     ///
     /// # Panics
-    /// If none come.
+    /// If there are none in time.
     #[track_caller]
     pub fn fresh(&self) -> Value {
         self.skip_lines();
-        // The next line may have been collected before.
+        // The next line may have been collected before this call.
         self.line();
         serde_json::from_str(&self.line()).unwrap()
     }
@@ -133,7 +133,7 @@ impl Process {
     /// Whether it has ended.
     ///
     /// # Panics
-    /// If the system does not say.
+    /// If the system cannot tell.
     pub fn has_ended(&mut self) -> bool {
         self.child.try_wait().unwrap().is_some()
     }
@@ -158,7 +158,7 @@ impl Process {
         rustix::process::kill_process(self.pid(), signal).unwrap();
     }
 
-    /// Stops it; returns once none of its threads runs.
+    /// Suspends it with SIGSTOP; returns when all of its threads are stopped.
     ///
     /// # Panics
     /// If it does not stop.
@@ -185,7 +185,7 @@ impl Process {
         ended(&mut self.child, PATIENCE)
     }
 
-    /// Ends it by this signal.
+    /// Ends it with this signal.
     ///
     /// # Panics
     /// If the exit code is not 0.
@@ -196,7 +196,7 @@ impl Process {
         assert_eq!(status.code(), Some(0), "after {signal:?}: {status}");
     }
 
-    /// Kills it by SIGKILL.
+    /// Kills it with SIGKILL.
     ///
     /// # Panics
     /// If the system refuses.

@@ -1,27 +1,27 @@
-//! Rust sources, for tests that look at the code.
+//! Rust sources, for tests that check the code.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// The folder of the repository.
+/// The root folder of the repository.
 ///
 /// # Panics
-/// Never: this crate is inside.
+/// Never, because this crate is inside the repository.
 pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap().to_path_buf()
 }
 
-/// A Rust source without comments and tests beside its code, its string literals apart.
+/// A Rust source without comments and without the test module at its end, with its string literals separate.
 #[derive(Debug, Default)]
 pub struct Source {
-    /// The code, with the number of each literal in its quotes.
+    /// The code, with the index of each literal between its quotes.
     pub code: String,
-    /// The literals, by their numbers.
+    /// The literals, by index.
     pub literals: Vec<String>,
 }
 
 impl Source {
-    /// The source of a file with this text.
+    /// Parses the text of a file.
     pub fn new(text: &str) -> Self {
         let text = &text[..tests_beside(text)];
         let mut source = Self::default();
@@ -37,7 +37,7 @@ impl Source {
             } else if let Some(behind) = rest.strip_prefix('"') {
                 rest = source.read_literal(behind);
             } else if let Some(behind) = rest.strip_prefix('\'') {
-                // A character, or a lifetime.
+                // A character literal, or a lifetime.
                 let len = match behind.as_bytes() {
                     [b'\\', ..] => behind[2..].find('\'').map_or(0, |end| end + 3),
                     _ => {
@@ -58,7 +58,7 @@ impl Source {
         self.literals.push(literal);
     }
 
-    /// Reads a literal behind its first quote; returns what is behind its last.
+    /// Reads a literal after its opening quote; returns the text after its closing quote.
     fn read_literal<'a>(&mut self, text: &'a str) -> &'a str {
         let (mut literal, mut rest) = (String::new(), text);
         loop {
@@ -83,10 +83,10 @@ impl Source {
     }
 }
 
-/// Every Rust file of a folder whose path, and that of each folder above it, is wanted.
+/// Reads the Rust files below a folder; skips files and folders for whose path `is_wanted` is false.
 ///
 /// # Panics
-/// If something cannot be read.
+/// If a file or a folder cannot be read.
 pub fn read(folder: &Path, is_wanted: impl Fn(&Path) -> bool) -> Vec<(PathBuf, Source)> {
     let (mut files, mut folders) = (Vec::new(), vec![folder.to_path_buf()]);
     while let Some(folder) = folders.pop() {
@@ -107,7 +107,7 @@ pub fn read(folder: &Path, is_wanted: impl Fn(&Path) -> bool) -> Vec<(PathBuf, S
     files
 }
 
-/// Where the tests of a file begin that are beside its code, at its end.
+/// The offset of the test module at the end of a file; the length of the text if it has none.
 fn tests_beside(text: &str) -> usize {
     let is_module = |rest: &str| {
         let line = rest.trim_start().lines().next().unwrap_or("");

@@ -1,22 +1,22 @@
-//! Configurations that several tests use, and how they are read.
+//! Configurations that several tests use, and functions that read them.
 
 use proto_core::config::GatewayConfig;
 use recipe_config::SimConfig;
 use recipe_config::file::{FileError, Text, parse_controller, parse_gateway};
 
-/// The gateway of this text.
+/// The gateway configuration in this text.
 ///
 /// # Panics
-/// With the first mistake in it.
+/// If the text has a mistake; the message names the first one.
 #[track_caller]
 pub fn gateway(toml: &str) -> Box<GatewayConfig> {
     right(parse_gateway(Text { name: "gateway.toml", toml }, &[]))
 }
 
-/// The controller of this text.
+/// The controller configuration in this text.
 ///
 /// # Panics
-/// With the first mistake in it.
+/// If the text has a mistake; the message names the first one.
 #[track_caller]
 pub fn controller(toml: &str) -> SimConfig {
     right(parse_controller(Text { name: "controller.toml", toml }, &[]))
