@@ -41,7 +41,7 @@ fn read_send(item: &TableValue<'_>) -> Result<SendOn> {
     Ok(SendOn::Rising { var, bit })
 }
 
-/// `rising:BitOutputReg[3].0`; `others` names further allowed texts.
+/// Reads a trigger such as `rising:BitOutputReg[3].0`; `others` lists the other allowed texts for messages.
 pub(super) fn read_rising(item: &TableValue<'_>, text: &str, others: &str) -> Result<(SysVar, u8)> {
     let Some(place) = text.strip_prefix("rising:") else {
         return Err(
@@ -59,7 +59,7 @@ pub(super) fn read_rising(item: &TableValue<'_>, text: &str, others: &str) -> Re
     Ok((var, bit))
 }
 
-/// The bindings of an input field: `to`, `commands`, or both.
+/// Reads the bindings of an input field: `to`, `commands`, or both.
 pub(super) fn read_input(field: &TableReader<'_>) -> Result<(Option<InputBinding>, Option<FileCommands>)> {
     let (to, commands) = (field.optional("to"), field.optional("commands"));
     if to.is_none() {
@@ -72,7 +72,7 @@ pub(super) fn read_input(field: &TableReader<'_>) -> Result<(Option<InputBinding
     Ok((to, commands.map(|item| commands::read(field, &item)).transpose()?))
 }
 
-/// A variable, or one bit of it.
+/// Reads the target of an input field: a variable, or one bit of it.
 fn read_to(field: &TableReader<'_>, to: &TableValue<'_>) -> Result<InputBinding> {
     let name = to.string()?;
     if let Some(bit) = VarBit::parse(name) {
@@ -89,7 +89,7 @@ fn read_to(field: &TableReader<'_>, to: &TableValue<'_>) -> Result<InputBinding>
     Ok(InputBinding::Variable { var: read_var(to)?, scale, offset })
 }
 
-/// `counter = true` or `counter = { max = 14 }`: the number after which the counter restarts at 0.
+/// Reads `counter = true` or `counter = { max = 14 }`: the number after which the counter restarts at 0.
 pub(super) fn read_counter(field: &TableReader<'_>, encoding: &Encoding) -> Result<Option<u32>> {
     let Some(item) = field.optional("counter") else { return Ok(None) };
     let (low, high) = encoding.range();

@@ -1,4 +1,4 @@
-//! `checksum` of a frame in a gateway file.
+//! Reads the `checksum` of a frame in a gateway file.
 //!
 //! In: the table, and the fields of the frame so far. Out: the fields with the checksum at its place.
 
@@ -36,7 +36,7 @@ pub(super) fn read_checksum(frame: &TableReader<'_>, head: usize, fields: &mut V
     Ok(())
 }
 
-/// `data_id = 0x1234`, low byte first, or a list of bytes.
+/// Reads `data_id`: a number such as `0x1234`, low byte first, or a list of bytes.
 fn read_data_id(table: &TableReader<'_>) -> Result<DataId> {
     let Some(item) = table.optional("data_id") else {
         refuse(table, &["data_id_at"], "allowed only together with data_id")?;
@@ -60,7 +60,7 @@ fn read_data_id(table: &TableReader<'_>) -> Result<DataId> {
     Ok(if table.word_or(&device::DATA_ID_AT, &DATA_ID_PLACES)? { id.behind() } else { id })
 }
 
-/// Data ids of profiles 2 and 22 of AUTOSAR's end-to-end protection: one for each number of the counter.
+/// Number of data ids in profiles 2 and 22 of AUTOSAR's end-to-end protection: one for each value of the counter.
 const LIST_OF_IDS: usize = 16;
 
 fn read_algorithm(table: &TableReader<'_>) -> Result<Algorithm> {
@@ -93,7 +93,7 @@ fn read_algorithm(table: &TableReader<'_>) -> Result<Algorithm> {
     }))
 }
 
-/// `"1.."` or `"1..7"`: the first byte and the last one.
+/// Reads the covered bytes, `"1.."` or `"1..7"`: the first byte, and the last one if given.
 fn read_covered(item: &TableValue<'_>) -> Result<(u16, Option<u16>)> {
     let text = item.string()?;
     let number = |text: &str| text.parse::<u16>().ok().filter(|&at| usize::from(at) < MAX_STREAM_FRAME);

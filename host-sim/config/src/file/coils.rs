@@ -23,7 +23,7 @@ struct Packer {
     padded: Option<Spot>,
 }
 
-/// The fields of a list, and the number of coils.
+/// Reads the fields of a list; returns them with the number of coils.
 pub(super) fn read(list: &TableValue<'_>, direction: Direction) -> Result<(Vec<FileField>, usize)> {
     let mut packer = Packer { fields: Vec::new(), count: 0, bytes: 0, padded: None };
     for item in list.array("of coils, such as [{ name = \"ready\", to = \"WordInputReg[1]\" }]")? {
@@ -58,7 +58,7 @@ impl Packer {
         Ok(())
     }
 
-    /// Fills bytes in which all coils are skipped.
+    /// Adds padding for bytes in which all coils are skipped.
     fn pad_up_to(&mut self, bytes: usize) {
         while self.bytes < bytes {
             let len = (bytes - self.bytes).min(usize::from(u8::MAX));

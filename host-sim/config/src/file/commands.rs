@@ -1,7 +1,7 @@
 //! The command table of an input field in a gateway file.
 //!
-//! In: `commands`, and the keys that say when a value picks a command. Out: ranges of values, and the command that each
-//! picks.
+//! In: `commands`, and the keys that say when a value selects a command. Out: ranges of values, each with the command
+//! that it selects.
 
 use proto_core::config::CommandWhen;
 
@@ -12,7 +12,7 @@ use crate::keys::field::{BASES, IDLE, WHEN, WHENS};
 /// The commands of a field, and the places of the entries.
 pub(super) type FileCommands = (FieldCommands, Vec<Spot>);
 
-/// First and last value, the command, and its place; the command is empty for values that pick nothing.
+/// First and last value, the command, and its place; the command is empty for values that select none.
 type FileCommand = ((i64, i64, String), Spot);
 
 fn with_places(when: CommandWhen, entries: Vec<FileCommand>) -> FileCommands {
@@ -63,7 +63,7 @@ fn read_values(
     Ok(with_places(when, entries))
 }
 
-/// Commands for the edges or the level of one bit.
+/// Reads the commands for the edges or the level of one bit.
 fn read_bit(field: &TableReader<'_>, table: &TableReader<'_>, keys: &[BitKey]) -> Result<FileCommands> {
     let is_level = keys.contains(&BitKey::Level);
     let mut entries = Vec::new();
@@ -113,7 +113,8 @@ fn bit_key(key: &str) -> Option<BitKey> {
     BIT_KEYS.into_iter().find(|(name, _)| *name == key).map(|(_, key)| key)
 }
 
-/// `bits = 3`, `bits = "3..3"`, or a coil, which has no type. Other mistakes are left to the reader of `bits`.
+/// Whether a field has one bit: `bits = 3`, `bits = "3..3"`, or a coil, which has no type. Does not check `bits`,
+/// which is read later.
 fn has_one_bit(field: &TableReader<'_>) -> bool {
     let Some(item) = field.optional("bits") else { return field.optional("type").is_none() };
     match item.as_string() {
@@ -132,7 +133,7 @@ fn read_command((key, key_spot, item): (&str, Spot, TableValue<'_>)) -> Result<F
     Ok(((first, last, read_text(&item)?), item.spot))
 }
 
-/// A value such as `1`, or a range such as `1..100`.
+/// Reads a value such as `1`, or a range such as `1..100`; `None` if it is neither.
 pub(super) fn read_range(key: &str) -> Option<(i64, i64)> {
     match key.split_once("..") {
         Some((first, last)) => read_value(first).zip(read_value(last)),

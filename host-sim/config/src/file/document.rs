@@ -205,7 +205,7 @@ fn parse_value(text: &str, at: At) -> Result<TreeNode, String> {
     }
 }
 
-/// The end of a message about a list in which a hexadecimal byte lacks its `0x`, such as `[48, AA]`.
+/// A hint for a list in which a hexadecimal byte lacks its `0x`, such as `[48, AA]`; otherwise empty.
 fn hexadecimal(text: &str, place: Option<usize>) -> String {
     let Some((before, after)) = place.and_then(|place| text.split_at_checked(place)) else {
         return String::new();

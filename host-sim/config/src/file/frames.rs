@@ -14,7 +14,7 @@ use super::names::meant_variable;
 use super::reader::{Result, Spot, TableReader, TableValue};
 use crate::keys;
 
-/// 11 bits, or 29 with `extended = true`.
+/// Reads a CAN id of 11 bits, or of 29 bits with `extended = true`.
 pub(super) fn read_id(frame: &TableReader<'_>, item: &TableValue<'_>) -> Result<CanId> {
     let is_extended = frame.flag(&keys::frame::EXTENDED)?;
     let limit = if is_extended { "0x1FFFFFFF" } else { "0x7FF" };

@@ -1,4 +1,4 @@
-//! Reads how frames are separated in a gateway file, texts, and lengths.
+//! Reads the framing of a part, texts and lengths in a gateway file.
 //!
 //! In: the tables of a part and of its fields. Out: the configuration's own types.
 
@@ -20,7 +20,7 @@ pub(super) const TEXT_KEYS: [&str; 5] = ["length_to", "count_to", "length_from",
 /// The keys of a length.
 pub(super) const LENGTH_KEYS: [&str; 3] = ["length", "counts", "plus"];
 
-/// `framing` and `escape` of a stream part.
+/// Reads `framing` and `escape` of a stream part.
 pub(super) fn read_part(part: &TableReader<'_>) -> Result<(Boundary, Option<Escape>)> {
     let framing = part.word(&FRAMING, &FRAMINGS)?;
     let escape = part.word(&ESCAPE, &ESCAPES)?;
@@ -33,7 +33,7 @@ pub(super) fn read_part(part: &TableReader<'_>) -> Result<(Boundary, Option<Esca
     Ok((framing.unwrap_or_default(), escape))
 }
 
-/// A field with `type = "text"`.
+/// Reads a field with `type = "text"`.
 pub(super) fn read_text(field: &TableReader<'_>, direction: Direction) -> Result<FieldSpec> {
     let keys = if direction == Direction::Input { TEXT_IN } else { TEXT_OUT };
     field.check_keys(&[keys], " in a text")?;
@@ -71,7 +71,7 @@ pub(super) fn read_text(field: &TableReader<'_>, direction: Direction) -> Result
     })
 }
 
-/// `ignore = ["NOREAD"]`: texts that a field of this width can have.
+/// Reads `ignore = ["NOREAD"]`, whose texts must fit into a field of this width.
 fn read_ignored(item: &TableValue<'_>, width: TextWidth) -> Result<Ignored> {
     let items = item.array("of texts, such as [\"NOREAD\"]")?;
     let mut texts = Vec::new();
@@ -99,7 +99,7 @@ fn read_ignored(item: &TableValue<'_>, width: TextWidth) -> Result<Ignored> {
     })
 }
 
-/// A field with `length = true` and this encoding.
+/// Reads a field with `length = true` and this encoding.
 pub(super) fn read_length(field: &TableReader<'_>, encoding: Encoding) -> Result<FieldSpec> {
     let item = field.required("length", "true, for the field that tells the frame's length")?;
     if !item.bool()? {

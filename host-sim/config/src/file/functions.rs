@@ -1,4 +1,4 @@
-//! `[functions]` of a controller file (D27).
+//! Reads `[functions]` of a controller file (D27).
 
 use super::reader::{Result, TableReader};
 use crate::functions::{
@@ -38,7 +38,7 @@ pub(super) fn read(root: &TableReader<'_>, programs: &[SimProgram]) -> Result<Fu
 /// The items that a table accepts.
 struct Items {
     takes: fn(InitialTarget) -> bool,
-    /// What other items cannot do.
+    /// What only these items can do, for messages about others.
     does: &'static str,
     allowed: &'static str,
 }
@@ -48,7 +48,7 @@ const INPUTS: Items =
 const OUTPUTS: Items =
     Items { takes: InitialTarget::shows_states, does: "show a state", allowed: FUNCTION_OUTPUTS };
 
-/// A table from items to `choices`, in file order.
+/// Reads a table that maps items to `choices`, in file order.
 fn read_table<T: Clone>(
     functions: &TableReader<'_>,
     key: &str,

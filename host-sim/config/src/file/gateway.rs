@@ -39,7 +39,7 @@ pub(super) fn read(document: &SourceTree) -> Result<Box<GatewayConfig>> {
     }
     let ports = root.any_tables("port")?;
     ports.iter().try_for_each(|port| port.check(&keys::gateway::PORT))?;
-    // Recipes may name ports.
+    // The names of all ports are needed first, because recipes may refer to any port.
     let port_names = ports.iter().filter_map(|port| port.optional("name")?.as_string()).map(str::to_owned);
     let mut assembly = Assembly {
         root: &root,
@@ -337,7 +337,7 @@ fn read_modbus_tcp(table: &TableReader<'_>) -> Result<Bus> {
     Ok(Bus::ModbusTcp { host: bounded(host), port })
 }
 
-/// A string that was read with the same limit.
+/// Copies a string whose length was checked when it was read.
 fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
     heapless::String::try_from(text).unwrap_or_default()
 }

@@ -72,11 +72,11 @@ fn names_before(frames: &[FileFrame], nth: usize) -> impl Iterator<Item = &str> 
     frames.iter().take(nth).filter_map(|frame| frame.order.name())
 }
 
-/// The error about frames that wait for each other in a circle.
+/// The error if frames wait for each other in a circle.
 fn circle(waiting: &[FileFrame]) -> (Spot, String) {
     let mut names: Vec<&str> = Vec::new();
     let mut at = waiting.first();
-    // Each of these waits for another of them, so the circle closes where a name repeats.
+    // Each of these frames waits for another one of them, so following `after` reaches a name a second time.
     while let Some(after) = at.and_then(|frame| frame.order.after())
         && !names.contains(&after)
     {

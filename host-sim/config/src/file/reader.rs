@@ -69,8 +69,8 @@ impl<'a> TableReader<'a> {
         self.check_names(&names, when, |_| false)
     }
 
-    /// Refuses a key that is not one of the names, and suggests the nearest name. A key that `is_known` is not
-    /// misspelled.
+    /// Refuses a key that is not one of the names, and suggests the nearest name. For a key for which `is_known` is
+    /// true, it suggests none.
     pub(super) fn check_names(
         &self,
         allowed: &[&str],
@@ -237,7 +237,7 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// A bit: 0 or 1, false or true.
+    /// A bit, written as 0 or 1, or as false or true.
     pub(super) fn bit(&self) -> Result<bool> {
         match self.as_bool() {
             Some(bit) => Ok(bit),

@@ -44,7 +44,7 @@ pub(super) fn read(
     Ok(limits.into_iter().collect())
 }
 
-/// A rule for the previous field.
+/// A rule that applies to the field before it.
 pub(super) fn behind(spot: Spot, spec: FieldSpec) -> FileField {
     FileField::new(spot, String::new(), spec)
 }

@@ -1,4 +1,4 @@
-//! Sources of output fields beside the variables, and the variables of a port's health.
+//! Sources of output fields other than variables, and the variables that show a port's health.
 //!
 //! In: `controller.mode`, `port.alive`, `port.NAME.alive`, `link.modbus.up`, and `health = { ... }` of a port. Out: the
 //! bindings and variables of the configuration.
@@ -10,13 +10,14 @@ use super::names::{did_you_mean, meant_variable};
 use super::reader::{Result, Spot, TableValue};
 use crate::keys::gateway::HEALTH_TABLE;
 
-/// Values of port 2000 that the gateway requests only when a device picks the command.
+/// Values that the gateway requests on port 2000 only when a device selects the command.
 const ASKED: [&str; 3] = ["last_error", "state", "isprogfinish"];
 
-/// A source, and if it is of a port, the port's name and place; the port may come after the recipe in the file.
+/// A source. If it belongs to a port, also the port's name and place, because the port may come after the recipe in the
+/// file.
 pub(super) type FileSource = (OutputBinding, Option<(String, Spot)>);
 
-/// Whether the text names such a source.
+/// Whether the text names a source of this kind.
 pub(super) fn is_source(text: &str) -> bool {
     ["controller.", "port.", "link."].iter().any(|kind| text.starts_with(kind))
 }
