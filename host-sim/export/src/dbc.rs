@@ -267,7 +267,7 @@ impl DbcWriter {
             let (mut name, mut tag, mut below) = (field.name().to_owned(), tag, below);
             match scope.in_several.get(field.name()) {
                 None => {}
-                // The same in every frame, so always present.
+                // The field is the same in every frame, so its signal is not multiplexed.
                 Some(Several::Same) => {
                     if !scope.done.insert(name.clone()) {
                         continue;
@@ -275,7 +275,7 @@ impl DbcWriter {
                     (tag, below) = ("", None);
                 }
                 Some(Several::Different) => {
-                    // Frames may have the same role, but not the same number.
+                    // Several frames may have the same role; their multiplexing numbers differ.
                     let number = below.map_or(0, |(_, number)| number);
                     let above = skipped.get(1).and(below).map_or("", |(above, _)| above);
                     name = format!("{name}-{}-{above}{number}", format.role.name());
@@ -415,7 +415,7 @@ fn shape(field: &FrameField, element: &Element) -> Option<SignalShape> {
     };
     let start = match order {
         ByteOrder::Big => {
-            // The highest bit, if the last byte is the lowest.
+            // The position of the highest bit if the last byte is the lowest.
             let highest = first + bits - 1;
             8 * (at + len - 1).checked_sub(highest / 8)? + highest % 8
         }
@@ -440,7 +440,7 @@ fn halves(shape: SignalShape) -> Vec<(&'static str, SignalShape)> {
     names.into_iter().zip(0..words).map(|(name, word)| (name, half(word, order))).collect()
 }
 
-/// Properties of a field's encoding that a signal cannot express.
+/// Describes what a signal cannot express of a field's encoding.
 fn encoding_words(element: &Element) -> Option<&'static str> {
     match element {
         Element::Text(_) => Some("characters, the first is the highest byte"),
@@ -454,7 +454,8 @@ fn encoding_words(element: &Element) -> Option<&'static str> {
     }
 }
 
-/// A quoted text. Characters other than ASCII have no encoding that every tool reads.
+/// The content of a quoted text. Replaces quotes, backslashes, and characters other than ASCII, which have no encoding
+/// that every tool reads.
 fn quoted(text: &str) -> String {
     let plain = |c: char| match c {
         '"' => "'".to_owned(),

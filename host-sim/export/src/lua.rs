@@ -206,7 +206,7 @@ fn width_of(element: &Element) -> Wide {
     }
 }
 
-/// The length in bytes of these fields, which is constant after a text that takes the rest.
+/// The total length of these fields in bytes. It is constant after a text that takes the rest of a frame.
 fn behind(fields: &[FrameField]) -> usize {
     let is_shared = |field: &&FrameField| {
         field
@@ -252,7 +252,7 @@ fn list(numbers: &[usize]) -> String {
     numbers.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
 }
 
-/// A string of Lua.
+/// A text as a string literal of Lua.
 fn quoted(text: &str) -> String {
     raw(text.as_bytes())
 }

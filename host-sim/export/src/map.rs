@@ -84,7 +84,7 @@ fn add_field(
     let rest = [&writer[..], &port.name, recipe, &frame, &place, &named, &uses];
     let mut variables: Vec<SysVar> = field.field.spec.variables().collect();
     variables.extend(field.system);
-    // Nobody has to enter a constant.
+    // A constant needs no row: there is nothing to configure for it.
     if variables.is_empty() && field.constant().is_none() {
         rows.push((usize::MAX, row(None, rest)));
     }
@@ -93,7 +93,8 @@ fn add_field(
     }
 }
 
-/// The writer of the value: what the owner of the file receives comes from its devices.
+/// The writer of the value: what the owner of the file receives comes from its devices, what it sends from the
+/// controller.
 fn writer(owner: Owner, direction: Direction) -> String {
     match (owner, direction) {
         (Owner::Gateway, Direction::Input) => "field",

@@ -27,7 +27,7 @@ pub fn mangle(name: &str) -> String {
     whole(&tokens).unwrap_or_else(|| shortened(name, &tokens))
 }
 
-/// The identifier of a name, if it need not be cut.
+/// The identifier of a name, if it is short enough.
 fn whole(tokens: &[String]) -> Option<String> {
     let identifier = if tokens.is_empty() { "_".to_owned() } else { tokens.concat() };
     (identifier.len() <= MAX_IDENTIFIER).then_some(identifier)
@@ -147,7 +147,7 @@ const HASH_LEN: usize = 10;
 /// Keywords of DBC.
 const KEYWORDS: [&str; 1] = ["VERSION"];
 
-/// The identifier in pieces that must not be cut.
+/// The identifier in pieces, none of which may be cut in two.
 fn tokens(name: &str) -> Vec<String> {
     let chars: Vec<char> = name.chars().collect();
     let is_plain =
@@ -183,9 +183,9 @@ fn escaped(c: char) -> String {
     format!("_x{:x}_", u32::from(c))
 }
 
-/// Whether a `_` copied from a name would be read as the beginning of something else. Its successor in the identifier
-/// begins like its successor in the name, up to the next character that is not plain, which becomes something that
-/// begins with `_`.
+/// Whether a `_` copied from a name would be read as the beginning of an index, an escaped character or the hash. The
+/// identifier continues as the name does, up to the next character that is not a letter or a digit; this one becomes
+/// something that begins with `_`.
 fn is_read_as_another(rest: &str) -> bool {
     let plain: String = rest[1..].chars().take_while(char::is_ascii_alphanumeric).collect();
     let ends = rest.len() == plain.len() + 1;
