@@ -107,12 +107,12 @@ impl Board {
         act(&mut self.devices, &mut self.scs, &at)
     }
 
-    /// Looks at all devices anew: what is next, and the interrupt lines.
+    /// Updates the next event and the interrupt line of each device.
     fn refresh(&mut self) {
         self.refresh_those(|_, _| true);
     }
 
-    /// The same, where only these can have changed.
+    /// As [`Self::refresh`], for the devices for which `is_meant` is true: only these can have changed.
     fn refresh_those(&mut self, is_meant: impl Fn(&DeviceEntry, Picos) -> bool) {
         let mut next = self.next;
         let (deadline, has_pending) = self.with_devices(|devices, scs, at| {
@@ -134,13 +134,13 @@ impl Board {
         self.has_pending = has_pending;
     }
 
-    /// Time of the next event of any device, whatever has been done to them from outside.
+    /// Time of the next event of any device. Takes into account what was done to devices from outside the board.
     pub(crate) fn deadline(&mut self) -> Picos {
         self.refresh();
         self.deadline
     }
 
-    /// The same, where nothing was done from outside.
+    /// As [`Self::deadline`], if nothing was done to devices from outside the board.
     pub(crate) fn known_deadline(&self) -> Picos {
         self.deadline
     }
@@ -150,7 +150,7 @@ impl Board {
         self.advance_those(core, |_, _| true);
     }
 
-    /// The same, where nothing but time has changed since [`Board::advance`] or an access.
+    /// As [`Self::advance`], if nothing but time has changed since the last call or the last access.
     pub(crate) fn advance_due(&mut self, core: Emulator) {
         let now = self.now;
         self.advance_those(core, |_, next| next <= now);
@@ -257,7 +257,7 @@ impl Board {
         let now = self.now;
         match accessed {
             _ if !is_write => self.refresh_those(|place, _| is_accessed(place)),
-            // All others see clocks, and the pins' functions.
+            // Clocks and pin functions affect all devices.
             Some(Id::Rcc) => {
                 self.apply_resets();
                 self.update_clocks();
@@ -362,7 +362,8 @@ impl Handler for Board {
     fn block(&mut self, core: Emulator, address: u32, len: u32) -> Flow {
         let must_stop = self.violation.is_some() || self.halt.is_some() || self.guard_changed;
         let must_stop = must_stop || self.scs.wants_reset();
-        // A program that asks the flash whether it is done, and reads it at once, has to see what it has written.
+        // A program that reads flash as soon as the registers report the end of programming must see what it has
+        // written.
         let must_stop = must_stop || self.devices.flash.has_changed();
         let is_due = self.now >= self.deadline || must_stop;
         let is_due = is_due || self.has_pending && self.scs.due(masks(core)).is_some();
@@ -371,7 +372,7 @@ impl Handler for Board {
         }
         let count = self.count(core, address, len);
         if count == u64::from(ENDLESS) {
-            // Only an interrupt can end it.
+            // Only an interrupt can end this loop.
             self.now = self.now.max(self.deadline);
             return Flow::Stop;
         }

@@ -44,7 +44,7 @@ pub struct Chip {
     is_asleep: bool,
     /// Steps since the log was read.
     steps_unread: u32,
-    /// Pages of flash that are not just read-only for the emulator.
+    /// Pages of flash with other access rights in the emulator than read-only.
     pages: BTreeMap<u32, flash::PageAccess>,
     /// The range of the MPU's guard region that is in effect.
     closed: Option<(u32, u32)>,
@@ -70,7 +70,7 @@ pub struct Chip {
 pub struct Stopped {
     /// What the program did wrong.
     pub violation: Violation,
-    /// The function it is in.
+    /// The function in which that happened.
     pub place: String,
 }
 
@@ -117,7 +117,7 @@ impl Chip {
         Ok(chip)
     }
 
-    /// Connects a new core with its memory.
+    /// Connects a new core to its memory and devices.
     fn connect(&mut self) -> Result<(), String> {
         let core = &self.core;
         core.map(FLASH, FLASH_SIZE, false)?;
@@ -132,8 +132,7 @@ impl Chip {
         self.program.waits.iter().try_for_each(|address| core.watch(*address))
     }
 
-    /// The core begins at the reset vector. It is the same one as before, because it keeps its translations of the
-    /// program.
+    /// Starts the core at the reset vector. Reuses the emulator's core, which keeps its translations of the program.
     fn start(&mut self) -> Result<(), String> {
         if let Some((start, size)) = self.closed.take() {
             self.core.protect(start, size, false)?;
@@ -149,15 +148,14 @@ impl Chip {
         Ok(())
     }
 
-    /// RAM after power-on.
+    /// Fills RAM as after power-on.
     fn fill_ram(&self) {
         for (address, size, fill) in RAM {
             self.engine().write(address, &vec![fill; size as usize]);
         }
     }
 
-    /// Makes a flash word (32 bytes) torn, as by a power failure while it is programmed: reading it is a bus
-    /// fault.
+    /// Makes a flash word (32 bytes) torn, as a power failure during programming does: reading it is a bus fault.
     ///
     /// # Errors
     /// The emulator refuses it.
@@ -181,7 +179,7 @@ impl Chip {
         self.restore_flash().expect("there is flash");
     }
 
-    /// Flash holds this from now on.
+    /// Replaces the contents of flash.
     ///
     /// # Panics
     /// There is no such flash.
@@ -190,7 +188,7 @@ impl Chip {
         self.restore_flash().expect("there is flash");
     }
 
-    /// The supply fails and comes back: a new start, with what is in flash.
+    /// The supply fails and comes back: the chip starts again with the contents of flash.
     pub fn cut_power(&mut self) {
         self.power_cuts += 1;
         self.board.reset(None);
@@ -262,7 +260,7 @@ impl Chip {
     /// A violation.
     pub fn run_until(&mut self, end: Picos) -> Result<(), Stopped> {
         self.board.limit = end;
-        // Outside, anything may have changed.
+        // The caller may have changed anything since the last run.
         let engine = self.engine();
         self.board.advance(engine);
         while self.board.now < end {
@@ -410,8 +408,8 @@ impl Chip {
         self.board.advance_due(engine);
     }
 
-    /// Resets the chip; flash and RAM keep their contents. The log is read before, since the program begins its buffer
-    /// anew.
+    /// Resets the chip; flash and RAM keep their contents. Reads the log first, because the program then clears its
+    /// buffer.
     fn reset(&mut self, cause: Cause) {
         self.read_log();
         self.board.reset(Some(cause));
@@ -419,7 +417,7 @@ impl Chip {
     }
 }
 
-/// The log is read at least once in so many steps.
+/// Maximum number of steps between two reads of the log.
 const LOG_PERIOD: u32 = 16;
 /// CFSR: UNDEFINSTR.
 const UNDEFINED: u32 = 1 << 16;

@@ -179,7 +179,7 @@ impl Devices {
         devices
     }
 
-    /// Somebody presses B1 for `span`, from `at` on; not before the end of an earlier press.
+    /// Presses button B1 for `span`, from `at` on, which must not be before the end of an earlier press.
     pub fn press_button(&mut self, at: Picos, span: Picos) {
         let port = &mut self.gpio[BUTTON.port()];
         port.drive(at, BUTTON.1, true);

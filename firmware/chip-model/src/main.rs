@@ -1,8 +1,8 @@
 //! `chip ELF [IMAGE] [--ms N] [--last N]`: runs the firmware for N ms of virtual time (default 2000) and
 //! prints its log; at the end the program counter, the last register accesses, and the speed of the run.
 //!
-//! With a loader as ELF, `--load ADDRESS=FILE` writes what is in a slot, as `host-sim ctl inspect --slot` makes it, and
-//! `--knows ELF` names the programs that run there.
+//! If ELF is a loader, `--load ADDRESS=FILE` writes the content of a slot, as made by `host-sim ctl inspect --slot`,
+//! and `--knows ELF` names a program that runs there.
 //!
 //! `chip ELF [IMAGE] --realtime [...]`: runs it in real time until it is interrupted, with sockets for its serial
 //! lines, CAN bus and Ethernet (docs/chip.md section 5).
@@ -32,9 +32,9 @@ fn main() -> ExitCode {
 
 struct Options {
     files: Vec<String>,
-    /// Bytes for flash, by their address.
+    /// Files to load into flash, by address.
     loads: Vec<(u32, String)>,
-    /// Programs that the first one runs.
+    /// ELF files of the programs that the first one runs.
     known: Vec<String>,
     ms: u64,
     last: usize,

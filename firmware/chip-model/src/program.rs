@@ -61,8 +61,8 @@ impl Program {
         Ok(Self { segments, waits: waits.collect(), rtt, functions, symbols, table })
     }
 
-    /// Knows also the code of other programs, which something else puts into flash: the firmware that this loader runs.
-    /// Their logs are at one place, and in one table.
+    /// Adds the symbols of other programs, which are put into flash in another way: the firmware that this loader runs.
+    /// All of them must have their log at the same address and use the same table of format strings.
     #[must_use]
     pub fn knowing(mut self, others: Vec<Self>) -> Self {
         for mut other in others {

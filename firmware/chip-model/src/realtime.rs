@@ -23,7 +23,7 @@ pub use network::exec_if_requested;
 use serial::Serial;
 use socket::{Client, Listener};
 
-/// What the board is connected to. Addresses are `HOST:PORT` or the path of a socket.
+/// What the board is connected to. An address is `HOST:PORT` or the path of a socket.
 #[derive(Debug, Default)]
 pub struct Backends {
     /// RS-485 A and B.
@@ -98,7 +98,7 @@ impl fmt::Display for Figures {
 pub enum RunEnd {
     /// A violation of the program.
     Stopped(Stopped),
-    /// Something that it needs is gone.
+    /// Something that the run needs is gone.
     Lost(String),
 }
 
@@ -138,7 +138,7 @@ impl Pace {
     }
 }
 
-/// Longest run between two looks at the sockets.
+/// Maximum virtual time between two checks of the sockets.
 const SLICE: Picos = MILLI;
 /// Events within this time are handled together.
 const COALESCE: Picos = MILLI / 4;
@@ -146,7 +146,7 @@ const COALESCE: Picos = MILLI / 4;
 const LONGEST: Picos = 100 * MILLI;
 /// A larger lag counts as late.
 const LATE: Picos = 10 * MILLI;
-/// A lag that is reported when it first reaches each multiple of this.
+/// The lag is reported when it first reaches each multiple of this.
 const HELD_UP: Picos = 250 * MILLI;
 
 impl Runner {
@@ -180,7 +180,7 @@ impl Runner {
     pub fn run(&mut self, end: &UnixStream, log: &mut dyn Write) -> Result<(), RunEnd> {
         self.pace = Pace { begin: Instant::now(), stopped: None };
         loop {
-            // While the core sleeps, the sockets need no look before its next event.
+            // While the core sleeps, the sockets need not be checked before its next event.
             let awake = self.chip.sleeps_until().unwrap_or(0).max(self.chip.now() + SLICE);
             let target = self.pace.now().min(awake);
             let result = if target > self.chip.now() { self.chip.run_until(target) } else { Ok(()) };
@@ -244,7 +244,7 @@ impl Runner {
         if behind > LATE {
             self.figures.late += wall.saturating_sub(self.figures.wall);
         }
-        // A test that fails meanwhile has the machine to blame.
+        // If a test fails at this time, the log shows that the machine was too slow.
         if behind / HELD_UP > self.figures.most_behind / HELD_UP {
             eprintln!("the chip is {:.3} s behind real time", behind as f64 / SECOND as f64);
         }

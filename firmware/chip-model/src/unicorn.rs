@@ -139,13 +139,14 @@ impl Emulator {
         unsafe { (self.api.reg_write)(self.uc, number, (&raw const value).cast()) };
     }
 
-    /// Gives all registers their values after a reset; the stack pointer and the program counter are the caller's.
+    /// Sets all registers to their values after a reset, except the stack pointer and the program counter, which the
+    /// caller sets.
     pub fn reset(self) {
         const THUMB: u32 = 1 << 24;
         for number in (Reg::R0 as i32..=Reg::R12 as i32).chain(Reg::S0 as i32..Reg::S0 as i32 + 32) {
             self.set_numbered(number, 0);
         }
-        // CONTROL first: it says which stack pointer is meant.
+        // CONTROL comes first, because it selects the stack pointer.
         for reg in [Reg::Control, Reg::Ipsr, Reg::Primask, Reg::Basepri, Reg::Faultmask, Reg::Fpscr] {
             self.set(reg, 0);
         }
@@ -250,7 +251,7 @@ impl Core {
         self.flush_rights()
     }
 
-    /// Forgets which accesses were allowed: they are cached, also when access rights have changed.
+    /// Drops the cache of allowed accesses, which the library keeps even if access rights change.
     ///
     /// # Errors
     /// The library returns an error.

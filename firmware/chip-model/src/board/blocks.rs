@@ -36,5 +36,5 @@ impl Board {
 }
 
 const NOP: u16 = 0xBF00;
-/// Stands for the number of instructions of a block that jumps to itself.
+/// Count of a block that jumps to itself.
 pub(super) const ENDLESS: u16 = u16::MAX;

@@ -1,5 +1,5 @@
-//! Flash as the emulator's memory: pages are read-only, and not readable if they contain a torn word, so
-//! that the model decides about each such access. The model owns the contents.
+//! Flash as memory of the emulator. Pages are read-only, and inaccessible if they contain a torn word, so that the
+//! model handles each write and each access to such a page. The model owns the contents.
 
 use super::{Chip, PRECISE_BUS};
 use crate::board::{FLASH, FLASH_SIZE};
@@ -14,8 +14,8 @@ impl Chip {
         self.board.devices.flash.torn().any(|word| page(word) == offset)
     }
 
-    /// Makes a page read-only, or inaccessible if it contains a torn word. Where nothing changes the emulator keeps
-    /// its translations.
+    /// Makes a page read-only, or inaccessible if it contains a torn word. If nothing changes, the emulator keeps its
+    /// translations.
     pub(super) fn close_page(&mut self, address: u32) -> Result<(), String> {
         let page = page(address);
         match (self.has_torn(address), self.pages.get(&page)) {
@@ -31,8 +31,8 @@ impl Chip {
         }
     }
 
-    /// Makes the emulator's memory what the cells are, also where code was patched or a power cut left something else.
-    /// Only what differs is written: the emulator drops its translations of what is.
+    /// Copies the cells to the emulator's memory, which may differ because code was patched or the power was cut.
+    /// Writes only pages that differ, because the emulator drops its translations of what is written.
     pub(super) fn restore_flash(&mut self) -> Result<(), String> {
         let engine = self.engine();
         let mut there = vec![0; FLASH_SIZE as usize];
@@ -50,12 +50,12 @@ impl Chip {
         pages.into_iter().try_for_each(|address| self.close_page(address))
     }
 
-    /// Executes one instruction with full access to a page of flash. That costs the emulator all its translations.
+    /// Executes one instruction with full access to a page of flash. The emulator then loses all of its translations.
     pub(super) fn step_in_page(&mut self, address: u32) {
         self.pages.insert(page(address), PageAccess::Full);
         self.core.protect(page(address), PAGE, false).expect("there is flash");
-        // This block was translated without a stop after one instruction, and so was that of the next instruction if
-        // a run has ever begun there.
+        // This block was translated without a stop after one instruction. So was the block that begins with the next
+        // instruction, if a run ever began there.
         self.core.invalidate(self.pc, 8);
         self.board.is_single_step = true;
         self.core.run_one(self.pc, &mut self.board);
@@ -89,8 +89,8 @@ impl Chip {
         }
     }
 
-    /// A write to flash: the model decides what the cells hold. A store that does nothing else is over then; any other
-    /// instruction is executed.
+    /// A write to flash: the model decides what the cells become. A simple store is then complete; any other instruction
+    /// is still executed.
     pub(super) fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
         let bytes = &value.to_le_bytes()[..size as usize];
         self.board.program_flash(self.pc, address - FLASH, bytes);
@@ -100,14 +100,14 @@ impl Chip {
         }
     }
 
-    /// An instruction was executed here.
+    /// Skips an instruction of this length, which was executed here instead of in the emulator.
     fn pass(&mut self, len: u32) {
         self.pc += len;
-        // After one refused access the emulator lets the next ones through.
+        // After it has refused one access, the emulator would allow the next ones.
         self.core.flush_rights().expect("it takes nothing");
     }
 
-    /// Copies what was erased or programmed into the emulator's memory.
+    /// Copies what was erased or programmed to the emulator's memory.
     pub(super) fn update_flash(&mut self) {
         for (offset, len) in self.board.devices.flash.take_changed() {
             let cells = &self.board.devices.flash.cells()[offset as usize..][..len as usize];
@@ -120,15 +120,17 @@ impl Chip {
     }
 }
 
-/// A load or store of one register that changes no other and is in no IT block: it needs no emulator.
+/// A load or store of one register that changes no other register and is in no IT block. It can be executed without the
+/// emulator.
 struct SimpleAccess {
     /// Length of the instruction.
     len: u32,
-    /// Of a load, the register and the number of bytes, which are extended with zeros.
+    /// For a load: the register, and the number of bytes, which are zero-extended.
     loads: Option<(u32, usize)>,
 }
 
-/// The present instruction, if it is one: LDR, LDRH, LDRB or STR with an offset (Armv7-M ARM A5.2.4, A5.3.7, A5.3.10).
+/// The current instruction, if it is a simple access: LDR, LDRH, LDRB or STR with an offset (Armv7-M ARM A5.2.4, A5.3.7,
+/// A5.3.10).
 fn plain(engine: Emulator, pc: u32) -> Option<SimpleAccess> {
     let word = engine.word(pc);
     let (low, high) = (word & 7, word >> 28);
@@ -144,17 +146,17 @@ fn plain(engine: Emulator, pc: u32) -> Option<SimpleAccess> {
         0xF890..0xF8A0 => (4, Some((high, 1))),
         _ => return None,
     };
-    // Into the stack pointer, the link register or the program counter.
+    // Loads into the stack pointer, the link register or the program counter have other effects.
     let is_special = loads.is_some_and(|(register, _)| register > 12);
     (!is_special).then_some(SimpleAccess { len, loads })
 }
 
-/// What the emulator lets the program do with a page, if that is not to read it alone.
+/// The emulator's access rights to a page that is not read-only.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PageAccess {
-    /// Nothing.
+    /// No access.
     None,
-    /// Anything.
+    /// Full access.
     Full,
 }
 

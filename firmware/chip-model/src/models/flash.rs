@@ -1,8 +1,9 @@
 //! The flash interface and its memory. RM0433, "Embedded Flash memory".
 //!
-//! A flash word has 32 bytes and an ECC. It is programmed as a whole, once after its sector (128 KiB) was
+//! A flash word has 32 bytes and an ECC. It is programmed as a whole, and only once after its sector (128 KiB) was
 //! erased. If it is programmed twice or interrupted, the ECC does not match, and reading it is a bus fault. An
-//! interrupted one may also read as something in between, or look blank and not take a write ([`Torn`]).
+//! interrupted one may also be readable and half programmed, or look blank and become torn when it is programmed
+//! ([`Torn`]).
 //! Refused: wrong keys, writes with LOCK set or without PG, incomplete flash words, register changes while the
 //! bank is busy, and too few wait states for the clock.
 
@@ -51,13 +52,13 @@ const BANK: u32 = 0x10_0000;
 const ERASE: Picos = 1_000 * MILLI;
 const PROGRAM: Picos = 100 * MICRO;
 
-/// What an interrupted operation leaves of a flash word.
+/// The state in which an interrupted operation leaves a flash word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Torn {
     /// Reading it is a bus fault.
     #[default]
     Fault,
-    /// It looks blank. What is programmed there is torn.
+    /// It looks blank, but is torn once it is programmed.
     Blank,
     /// Some of its bits are programmed, and it can be read.
     Half,
@@ -87,12 +88,12 @@ pub struct Flash {
     bank: Bank,
     halves: [Half; 2],
     contents: Contents,
-    /// What interrupted operations leave.
+    /// The state in which interrupted operations leave flash words.
     pub leaves: Torn,
     /// The power fails during the operation of this number ([`Flash::operations`]).
     pub fails_during: Option<u64>,
     operations: u64,
-    /// If it is there, each operation is noted in it when it begins.
+    /// If present, records each operation when it begins.
     pub journal: Option<Vec<FlashOperation>>,
     /// Ranges that have changed since [`Flash::take_changed`].
     changed: Vec<(u32, u32)>,
@@ -101,7 +102,7 @@ pub struct Flash {
 }
 
 impl Flash {
-    /// Both banks are erased.
+    /// Flash with both banks erased.
     pub fn new() -> Self {
         Self {
             bank: Bank::new(&REGISTERS),
@@ -116,23 +117,23 @@ impl Flash {
         }
     }
 
-    /// Programs bytes without checks, like a debugger, which erases before. What was torn there is whole.
+    /// Programs bytes without checks, like a debugger, which erases first. Torn words there become valid.
     pub fn load(&mut self, offset: u32, bytes: &[u8]) {
         self.contents.blank(offset, bytes.len() as u32);
         self.contents.put(offset, bytes);
     }
 
-    /// The contents of both banks.
+    /// The bytes of both banks.
     pub fn cells(&self) -> &[u8] {
         self.contents.cells()
     }
 
-    /// All that flash holds.
+    /// The bytes of both banks, with the torn words.
     pub fn contents(&self) -> &Contents {
         &self.contents
     }
 
-    /// It holds this from now on.
+    /// Replaces the contents.
     #[cfg(any(test, feature = "emulator"))]
     pub(crate) fn hold(&mut self, contents: &Contents) {
         self.contents.clone_from(contents);
@@ -153,7 +154,7 @@ impl Flash {
         std::mem::take(&mut self.changed)
     }
 
-    /// Whether there are such ranges.
+    /// Whether any range has changed since [`Flash::take_changed`].
     #[cfg(any(test, feature = "emulator"))]
     pub(crate) fn has_changed(&self) -> bool {
         !self.changed.is_empty()
@@ -164,7 +165,7 @@ impl Flash {
         self.operations
     }
 
-    /// Whether the power fails now, once for each `fails_during`.
+    /// Whether the power fails now; true only once for each value of `fails_during`.
     #[cfg(any(test, feature = "emulator"))]
     pub(crate) fn has_failed(&mut self) -> bool {
         self.fails_during.take_if(|number| *number == self.operations).is_some()
@@ -346,7 +347,7 @@ impl Peripheral for Flash {
         self.halves.iter().filter_map(|half| half.work.as_ref().map(|work| work.until)).min()
     }
 
-    /// An operation in progress is interrupted.
+    /// Interrupts an operation in progress.
     fn reset(&mut self) {
         self.lose_power();
         self.bank = Bank::new(&REGISTERS);

@@ -1,7 +1,8 @@
 //! GPIO ports A to K. RM0433, "General-purpose I/Os".
 //!
-//! Changes of outputs are recorded with their times. An input reads what is outside, or its pull, or 1 where there is
-//! neither; an output reads itself, an analog pin 0. Other models check the alternate functions of their pins.
+//! Changes of outputs are recorded with their times. An input reads the level from outside, or that of its pull
+//! resistor, or 1 without either; an output reads its own level, an analog pin 0. Other models check the alternate
+//! functions of their pins.
 
 use crate::device::*;
 
@@ -84,7 +85,7 @@ impl Port {
         (self.mode(pin) == Mode::Output).then(|| self.bank.get(ODR) >> pin & 1 != 0)
     }
 
-    /// Something outside drives a pin from this time on, after all that was said of this pin before.
+    /// Something outside drives a pin from this time on, which must not be before those of earlier calls for this pin.
     pub fn drive(&mut self, from: Picos, pin: u8, level: bool) {
         self.outside.push((from, pin, level));
     }

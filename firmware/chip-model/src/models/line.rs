@@ -86,7 +86,7 @@ impl Line {
         }
     }
 
-    /// Removes what the chip has sent, and the old changes of driver-enable.
+    /// Takes the characters that the chip has sent, and drops old changes of driver-enable.
     pub fn take_sent(&mut self) -> std::vec::Drain<'_, Sent> {
         let old = self.driver.len().saturating_sub(DRIVER_KEPT);
         self.driver.drain(..old);
@@ -107,13 +107,13 @@ impl Line {
         !self.has_four_wires && self.is_driven(at) || last.map_or(!self.is_low, |(_, level)| *level)
     }
 
-    /// The next falling edge that was not sampled yet, up to `now`.
+    /// The next falling edge that the receiver has not sampled yet, up to `now`.
     pub(super) fn start_bit(&self, now: Picos) -> Option<Picos> {
         let falls = self.edges.iter().find(|(time, level)| !level && *time >= self.consumed);
         falls.map(|(time, _)| *time).filter(|time| *time <= now)
     }
 
-    /// The same, also in the future.
+    /// As [`Self::start_bit`], also in the future.
     pub(super) fn next_start_bit(&self) -> Option<Picos> {
         self.start_bit(Picos::MAX)
     }
@@ -129,5 +129,5 @@ impl Line {
     }
 }
 
-/// Changes of driver-enable that [`Line::take_sent`] keeps: more than one character has.
+/// Number of changes of driver-enable that [`Line::take_sent`] keeps: more than there are in one character.
 const DRIVER_KEPT: usize = 16;

@@ -45,7 +45,7 @@ pub struct Rcc {
     /// Ready flag of each oscillator, and when it is set.
     ready: [(u32, Picos); 5],
     low_speed: Option<Picos>,
-    /// Clocks that were enabled and not followed by a read yet.
+    /// Clocks that were enabled, with no read since.
     fresh: Option<Gate>,
 }
 
@@ -102,7 +102,7 @@ impl Rcc {
         Ok(())
     }
 
-    /// A read: clocks that were enabled before it are running now.
+    /// Notes a read: clocks that were enabled before it are running now.
     pub fn settle(&mut self) {
         self.fresh = None;
     }

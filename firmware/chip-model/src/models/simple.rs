@@ -133,7 +133,7 @@ impl Plain {
         self.0.get(offset)
     }
 
-    /// Sets a register until the next reset, as another chip has it.
+    /// Sets a register until the next reset, to model another chip.
     pub fn put(&mut self, offset: u32, value: u32) {
         self.0.set(offset, value);
     }

@@ -34,7 +34,7 @@ pub struct Timer {
     bank: Bank,
     /// When the counter was 0 for the first time.
     zero: Picos,
-    /// Ticks since `zero` whose events were handled.
+    /// Number of ticks since `zero` whose events have been handled.
     seen: u64,
     tick: Picos,
     /// The prescaler in effect: PSC is loaded at an update event.
@@ -66,7 +66,7 @@ impl Timer {
             return;
         }
         let (from, to) = (self.seen, self.ticks(now));
-        // How often the counter has reached `count`.
+        // The number of times that the counter has reached `count`.
         let often = |ticks: u64, count: u64| (ticks + ROUND - count) / ROUND;
         let mut flags = self.bank.get(SR);
         for (count, flag) in self.events() {

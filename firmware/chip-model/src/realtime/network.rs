@@ -15,7 +15,7 @@ use super::socket::Client;
 use crate::device::*;
 use crate::models::ethernet::Ethernet;
 
-/// First argument of this program that makes it execute another one, which ends with its parent.
+/// The first argument with which this program executes another one, which is killed when its parent ends.
 pub(super) const END_WITH: &str = "--end-with";
 /// Bytes per read.
 const CHUNK: usize = 1 << 16;

@@ -1,11 +1,11 @@
-//! The library's callbacks, which call the handler of the present run.
+//! The library's callbacks, which call the handler of the current run.
 
 use std::ffi::{c_int, c_void};
 
 use super::library::Uc;
 use super::{Emulator, Exit, Flow, Handler, HookState};
 
-/// Calls the handler of the present run.
+/// Calls the handler of the current run.
 fn with<T>(
     uc: Uc,
     user: *mut c_void,

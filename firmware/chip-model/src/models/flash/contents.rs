@@ -1,7 +1,7 @@
-//! What flash holds: its bytes, and the words that a power cut has left in another state than they seem to be in.
+//! The contents of flash: its bytes, and the words whose true state after a power cut is not visible in their bytes.
 //!
-//! In: operations, whole or interrupted. So the flash of any moment can be made again from the operations that were
-//! noted before it.
+//! In: operations, complete or interrupted. Out: the contents after them. The contents at any time can thus be restored
+//! from a record of the operations before it.
 
 use std::collections::BTreeSet;
 
@@ -13,11 +13,11 @@ pub struct Contents {
     cells: Vec<u8>,
     /// Offsets of the flash words whose ECC does not match.
     torn: BTreeSet<u32>,
-    /// Offsets of those that only look blank.
+    /// Offsets of the flash words that only look blank ([`Torn::Blank`]).
     only_looks_blank: BTreeSet<u32>,
 }
 
-/// What changes flash.
+/// An operation that changes flash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FlashOperation {
     /// A sector is erased.
@@ -29,13 +29,13 @@ pub enum FlashOperation {
     Program {
         /// Its offset.
         address: u32,
-        /// What is written.
+        /// The new bytes.
         bytes: [u8; WORD as usize],
     },
 }
 
 impl Contents {
-    /// Everything is erased.
+    /// Contents with everything erased.
     pub fn erased() -> Self {
         let cells = vec![0xFF; 2 * BANK as usize];
         Self { cells, torn: BTreeSet::new(), only_looks_blank: BTreeSet::new() }
@@ -51,7 +51,7 @@ impl Contents {
         self.torn.iter().copied()
     }
 
-    /// An operation comes to its end.
+    /// Executes an operation completely.
     pub fn execute(&mut self, operation: &FlashOperation) {
         match *operation {
             FlashOperation::Erase { first } => self.blank(first, SECTOR),
@@ -71,7 +71,7 @@ impl Contents {
             FlashOperation::Program { address, bytes } => self.interrupt_word(*address, bytes, leaves),
             FlashOperation::Erase { first } => {
                 for address in (*first..first + SECTOR).step_by(WORD as usize) {
-                    // Neighbours differ, and each cut differs from the one before.
+                    // Neighbouring words differ, and each power cut differs from the previous one.
                     match (address / WORD).wrapping_add(salt).wrapping_mul(0x9E37_79B9) >> 30 {
                         0 => {}
                         1 => self.blank(address, WORD),
@@ -82,7 +82,7 @@ impl Contents {
         }
     }
 
-    /// What is left of a word that would have become `bytes`.
+    /// Interrupts the programming of a word that would have become `bytes`.
     fn interrupt_word(&mut self, address: u32, bytes: &[u8; WORD as usize], leaves: Torn) {
         match leaves {
             Torn::Fault => _ = self.torn.insert(address),
