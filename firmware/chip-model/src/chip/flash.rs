@@ -89,8 +89,8 @@ impl Chip {
         }
     }
 
-    /// A write to flash: the model decides what the cells become. A simple store is then complete; any other instruction
-    /// is still executed.
+    /// A write to flash: the model decides what the cells become. A simple store is then complete; any other
+    /// instruction is still executed.
     pub(super) fn program_flash(&mut self, address: u32, (value, size): (u32, u32)) {
         let bytes = &value.to_le_bytes()[..size as usize];
         self.board.program_flash(self.pc, address - FLASH, bytes);
@@ -129,8 +129,8 @@ struct SimpleAccess {
     loads: Option<(u32, usize)>,
 }
 
-/// The current instruction, if it is a simple access: LDR, LDRH, LDRB or STR with an offset (Armv7-M ARM A5.2.4, A5.3.7,
-/// A5.3.10).
+/// The current instruction, if it is a simple access: LDR, LDRH, LDRB or STR with an offset (Armv7-M ARM A5.2.4,
+/// A5.3.7, A5.3.10).
 fn plain(engine: Emulator, pc: u32) -> Option<SimpleAccess> {
     let word = engine.word(pc);
     let (low, high) = (word & 7, word >> 28);
