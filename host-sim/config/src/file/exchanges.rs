@@ -1,6 +1,6 @@
 //! `[[recipe.exchange]]`: requests to devices, their replies, and when they are sent.
 //!
-//! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s with laid out frames. The frames here are a
+//! In: the tables of a gateway file's recipe. Out: [`FileExchange`]s with their frames laid out. The frames here are a
 //! device's own; those of Modbus are in `modbus`.
 
 use proto_core::config::{
@@ -21,7 +21,7 @@ use crate::device::ExchangeKind;
 use crate::keys::frame::OF_FRAME;
 use crate::keys::{self, exchange};
 
-/// The exchanges of a stream or CAN recipe.
+/// Reads the exchanges of a stream or CAN recipe.
 pub(super) fn read_all(recipe: &TableReader<'_>, mode: Mode, is_can: bool) -> Result<Vec<FileExchange>> {
     let tables = recipe.any_tables("exchange")?;
     if let Some(item) = recipe.optional("exchange").filter(|_| mode != Mode::User) {
@@ -32,7 +32,7 @@ pub(super) fn read_all(recipe: &TableReader<'_>, mode: Mode, is_can: bool) -> Re
     tables.iter().map(|table| read(table, is_can, &names)).collect()
 }
 
-/// The names of exchanges, `None` for those without one.
+/// Reads the names of exchanges; `None` for those without one.
 pub(super) fn names(tables: &[TableReader<'_>]) -> Result<Vec<Option<String>>> {
     let mut names: Vec<Option<String>> = Vec::new();
     for table in tables {
@@ -115,7 +115,7 @@ fn read(table: &TableReader<'_>, is_can: bool, names: &[Option<String>]) -> Resu
     })
 }
 
-/// When the values of a reply are overdue.
+/// Reads the time after which the values of a reply are overdue.
 pub(super) fn read_overdue(table: &TableReader<'_>, key: &str) -> Result<Option<Duration>> {
     let own = table.optional(key);
     let Some(item) = table.optional(exchange::EXPECT.name) else {
@@ -149,7 +149,7 @@ pub(super) fn spots(table: &TableReader<'_>, own: &[(&str, ExchangeKey)]) -> Vec
     keys.chain([(ExchangeKey::Whole, table.spot.clone())]).collect()
 }
 
-/// The field of a reply that reports a restart; its place is added to `spots`.
+/// Finds the field of a reply that reports a restart; adds its place to `spots`.
 pub(super) fn restarted(
     table: &TableReader<'_>,
     reply: Option<&FilePart>,
@@ -259,13 +259,14 @@ impl FileFrame {
         Self { id_spot: spot.clone(), spot, id, fields: Vec::new(), order }
     }
 
-    /// Registers or coils.
+    /// The registers or coils of an exchange, without a frame around them.
     pub(super) fn of_fields(spot: Spot, fields: Vec<FileField>) -> Self {
         Self { fields, ..Self::new(spot) }
     }
 }
 
-/// When an exchange is requested, its timeouts, and its repetitions; `names` are those of all exchanges of the recipe.
+/// Reads when an exchange is requested, its timeouts and its repetitions; `names` has the names of all exchanges of the
+/// recipe.
 pub(super) fn read_settings(
     table: &TableReader<'_>,
     peer: u8,
@@ -298,7 +299,7 @@ pub(super) fn check_asked(table: &TableReader<'_>, settings: &Exchange) -> Resul
     if settings.is_never() { Err(table.error(ExchangeError::Never)) } else { Ok(()) }
 }
 
-/// The number of the exchange with this name.
+/// Reads the name of an exchange and returns its number.
 fn read_follow(item: &TableValue<'_>, names: &[Option<String>]) -> Result<u8> {
     let name = item.string()?;
     let nth = names.iter().position(|other| other.as_deref() == Some(name));
@@ -312,7 +313,7 @@ fn read_follow(item: &TableValue<'_>, names: &[Option<String>]) -> Result<u8> {
     })
 }
 
-/// The variables that report the outcome of events.
+/// Reads the variables that report the outcome of events.
 fn read_outcome(item: &TableValue<'_>) -> Result<OutcomeTo> {
     let table = item.table(&exchange::OUTCOME_TABLE)?;
     let variable = |key| -> Result<Option<SysVar>> {
@@ -330,7 +331,7 @@ fn read_outcome(item: &TableValue<'_>) -> Result<OutcomeTo> {
     Ok(outcome)
 }
 
-/// One entry of `on`.
+/// Reads one entry of `on`.
 fn read_on(item: &TableValue<'_>, when: &mut Triggers) -> Result<()> {
     let text = item.string()?;
     let flag =

@@ -24,7 +24,7 @@ pub fn function_name(operation: &Operation) -> &'static str {
     FUNCTIONS.iter().find(|(_, known)| *known == code).map_or("", |(name, _)| name)
 }
 
-/// The exchanges of a master.
+/// Reads the exchanges of a master.
 pub(super) fn read_master(recipe: &TableReader<'_>) -> Result<Vec<FileExchange>> {
     let exchanges = recipe.any_tables("exchange")?;
     if exchanges.is_empty() {
@@ -34,7 +34,7 @@ pub(super) fn read_master(recipe: &TableReader<'_>) -> Result<Vec<FileExchange>>
     exchanges.iter().map(|table| read_exchange(table, &names)).collect()
 }
 
-/// The blocks of a slave.
+/// Reads the blocks of a slave.
 pub(super) fn read_slave(recipe: &TableReader<'_>) -> Result<Vec<FileExchange>> {
     let address =
         recipe.integer_needed(&keys::recipe::ADDRESS, "the gateway's own address on the line, 1..=247")?;
@@ -170,7 +170,7 @@ fn read_block(table: &TableReader<'_>, peer: u8) -> Result<FileExchange> {
     })
 }
 
-/// The address of the first register or coil. The six-digit numbers of manuals are not addresses.
+/// Reads the address of the first register or coil. The six-digit numbers of manuals are not addresses.
 fn read_first(item: &TableValue<'_>, table: Table) -> Result<u16> {
     item.integer(exchange::ADDRESS.integers()).map_err(|mut error| {
         let number = item.as_integer().and_then(|number| u32::try_from(number).ok());
@@ -215,7 +215,7 @@ fn direction_of(block: &TableReader<'_>, holds: Table) -> Result<Direction> {
     }))
 }
 
-/// Reads a function given by name or by number, with counts of 1.
+/// Reads a function given by name or by number. The counts of the operation are 1, to be set later.
 fn read_function(table: &TableReader<'_>) -> Result<Operation> {
     let item = table.required("function", "such as \"read-input-registers\", or its number, 4")?;
     let number = match item.as_integer() {

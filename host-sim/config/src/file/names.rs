@@ -4,7 +4,7 @@
 
 use proto_core::sysvar::SysVar;
 
-/// `; did you mean "x"?` with the nearest of `names`.
+/// Suggests the nearest of `names` as `; did you mean "x"?`; empty if none is similar.
 pub(super) fn did_you_mean<'n>(given: &str, names: impl Iterator<Item = &'n str>) -> String {
     let near = names.map(|name| (distance(given, name), name)).min();
     match near {
@@ -13,7 +13,7 @@ pub(super) fn did_you_mean<'n>(given: &str, names: impl Iterator<Item = &'n str>
     }
 }
 
-/// Number of wrong, missing, extra or swapped letters. A missing unit counts as one mistake.
+/// The number of wrong, missing, extra or swapped letters in a name. A missing unit counts as one mistake.
 fn distance(given: &str, name: &str) -> usize {
     let whole = strsim::osa_distance(given, name);
     let bare = name.rsplit_once('_').filter(|(_, unit)| matches!(*unit, "ms" | "us"));
@@ -65,7 +65,7 @@ pub(super) fn meant_checksum(given: &str, names: &[&str]) -> String {
     }
 }
 
-/// A name that differs only in signs and capitals, else an alias, else the nearest name.
+/// Suggests the name that differs only in punctuation and case, else the name with this alias, else the nearest name.
 fn meant(given: &str, names: &[&str], aliases: &[(&str, &str)]) -> String {
     let given_plain = plain(given);
     if let Some(name) = names.iter().find(|name| plain(name) == given_plain) {
@@ -83,7 +83,7 @@ fn ask(name: &str) -> String {
     format!("; did you mean {name:?}?")
 }
 
-/// Only letters and digits, in lower case.
+/// Reduces a name to its letters and digits, in lower case.
 fn plain(name: &str) -> String {
     name.chars().filter(char::is_ascii_alphanumeric).map(|c| c.to_ascii_lowercase()).collect()
 }
@@ -99,7 +99,7 @@ const KEYS: [(&str, &str); 7] = [
     ("extendedid isextended ext", "extended"),
 ];
 
-/// Names of the types in other tools. If a name has several meanings or none here: what to write.
+/// Names of types in other tools, with the type here. If there is none or a name has several meanings: what to write.
 const TYPES: [(&str, &str); 15] = [
     ("i8 int8 s8 sint signedchar", "char"),
     ("u8 uint8 usint unsignedchar octet", "byte"),

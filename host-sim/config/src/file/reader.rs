@@ -10,7 +10,7 @@ use proto_core::time::Duration;
 
 pub(super) type Result<T> = std::result::Result<T, FileError>;
 
-/// A place and the key there.
+/// A place in a file or an override, and the key there.
 #[derive(Debug, Clone)]
 pub(super) struct Spot {
     pub(super) at: At,
@@ -165,12 +165,12 @@ impl<'a> TableReader<'a> {
         }
     }
 
-    /// The value of a key's word; `None` if the key is absent.
+    /// The choice that a key's word selects; `None` if the key is absent.
     pub(super) fn word<T: Clone>(&self, key: &Key, choices: &[(&str, T)]) -> Result<Option<T>> {
         self.optional(key.name).map(|item| item.choice(choices)).transpose()
     }
 
-    /// The value of a key's word, or of its default.
+    /// The choice that a key's word selects, or that of its default.
     pub(super) fn word_or<T: Clone>(&self, key: &Key, choices: &[(&str, T)]) -> Result<T> {
         let default = match key.need {
             Need::Word(word) => choices.iter().find(|(name, _)| *name == word),
@@ -263,7 +263,7 @@ impl<'a> TableValue<'a> {
         }
     }
 
-    /// An error about a value that is no integer; `allowed` is the range.
+    /// An error about a value that is not an integer; `allowed` is the range.
     pub(super) fn no_integer(&self, allowed: &str) -> FileError {
         let mut error = self.wrong_kind(&format!("an integer in {allowed}"));
         if let Some(number) = self.as_string().map(str::trim).filter(|text| is_number(text)) {
@@ -340,7 +340,7 @@ impl<'a> TableValue<'a> {
         Ok(TableReader { document: self.document, spot, table })
     }
 
-    /// One of several strings. The error suggests the nearest one.
+    /// The choice that the string selects. The error for an unknown string suggests the nearest one.
     pub(super) fn choice<T: Clone>(&self, choices: &[(&str, T)]) -> Result<T> {
         self.choice_or(choices, |text| did_you_mean(text, choices.iter().map(|(name, _)| *name)))
     }

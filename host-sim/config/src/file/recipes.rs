@@ -1,4 +1,4 @@
-//! `[[recipe]]` of both kinds of files: read once, and checked by the layouts themselves.
+//! `[[recipe]]` of both kinds of files: read in one place, and checked by laying out the frames.
 //!
 //! In: tables. Out: [`FileRecipe`]s, which have places for later checks.
 
@@ -26,7 +26,7 @@ use crate::keys;
 use crate::keys::recipe::{KINDS, MODES, RecipeKind};
 use crate::sim::{SimCanFrame, SimField, SimParts, SimRecipe, SimStreamPart};
 
-/// Every recipe of a file, within the limits of any port.
+/// Reads every recipe of a file, within the limits of any port.
 pub(super) fn read_all(root: &TableReader<'_>, flavour: Flavour) -> Result<Vec<FileRecipe>> {
     let mut recipes: Vec<FileRecipe> = Vec::new();
     let tables = root.any_tables("recipe")?;
@@ -42,7 +42,7 @@ pub(super) fn read_all(root: &TableReader<'_>, flavour: Flavour) -> Result<Vec<F
     Ok(recipes)
 }
 
-/// The index of the recipe with the name in `item`.
+/// Finds the recipe with the name in `item`; returns its index.
 pub(super) fn find(recipes: &[FileRecipe], item: &TableValue<'_>) -> Result<usize> {
     let name = item.string()?;
     recipes.iter().position(|recipe| recipe.name == name).ok_or_else(|| {
@@ -54,7 +54,7 @@ pub(super) fn find(recipes: &[FileRecipe], item: &TableValue<'_>) -> Result<usiz
     })
 }
 
-/// A name that `--bind NAME=DEVICE` and `--set` can carry, of at most 32 bytes.
+/// Reads a name of at most 32 bytes that can be written in `--bind NAME=DEVICE` and `--set`.
 pub(super) fn read_name(table: &TableReader<'_>) -> Result<(String, Spot)> {
     let item = table.required("name", "the name that ports and tools refer to it by")?;
     let name = item.string()?;
@@ -110,7 +110,7 @@ fn read_mode(table: &TableReader<'_>, kind: RecipeKind) -> Result<Mode> {
     }
 }
 
-/// What all exchanges do while a value that they send is stale.
+/// Reads what all exchanges do while a value that they send is stale.
 fn read_on_stale(table: &TableReader<'_>, has_output: bool, is_without: bool) -> Result<Option<OnStale>> {
     let Some(item) = table.optional("on_stale") else { return Ok(None) };
     if has_output {
