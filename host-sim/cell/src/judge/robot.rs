@@ -101,18 +101,18 @@ impl Robot {
         }
     }
 
-    /// How long data sent since then may have waited in the transport: while the gateway is not called, it cannot take
-    /// data back.
+    /// How long data that the gateway has sent since then may have waited in the transport. A gateway that is not called
+    /// cannot withdraw it.
     pub(super) fn transport(&self, rules: &Rules, since: Instant) -> Duration {
         if self.not_called >= since { rules.transport } else { Duration::ZERO }
     }
 
-    /// The gateway has started, and knows nothing of what was before.
+    /// The gateway has started, and knows nothing of earlier readings.
     pub(super) fn gateway_starts(&mut self, now: Instant) {
         self.started = now;
     }
 
-    /// The gateway wakes. It may never take replies that were sent before, unless they are known to be taken.
+    /// The gateway wakes. It may never process replies that were sent before, except those that it certainly received.
     pub(super) fn gateway_wakes(&mut self, now: Instant) {
         self.woke = now;
     }
@@ -137,8 +137,8 @@ impl Robot {
         let conn = self.conns.entry(id).or_default();
         conn.came.extend_from_slice(bytes);
         while let Some(frame) = next_frame(&mut conn.came) {
-            // The gateway has one request in flight, and gives it up after half a second. An earlier request shows that
-            // it has received the reply.
+            // The gateway has one request in flight, and gives it up after half a second. A new request before then shows
+            // that it has received the reply.
             let before = conn.newest.replace(now);
             if let Some(before) = before.filter(|before| now.saturating_since(*before) < SURELY_TAKEN) {
                 for nth in conn.open.drain(..) {
@@ -235,7 +235,7 @@ impl Robot {
         let mut why = "it was carried out, and the bit was not read rising".to_owned();
         for nth in 0..self.readings.len() {
             let on = self.readings[nth];
-            // What the gateway sent before its restart may still be on the line.
+            // Requests that the gateway sent before its restart may still be on the line.
             let is_of_before = on.answered < self.started && now > self.started + super::ON_THE_LINE;
             if !on.moves || is_of_before {
                 continue;

@@ -1,4 +1,4 @@
-//! The exchanges of one line or bus: the request in flight, its reply, and when which exchange may be sent
+//! The exchanges of one line or bus: the request in flight, its reply, and which exchanges may be sent when
 //! (proto-core/docs/wire/modbus-rtu.md sections 4 and 5, docs/configuration.md section 4, "Exchanges").
 //!
 //! Does not predict the next request. Says which requests may be sent, which must not, and for how long the line may be
@@ -555,7 +555,7 @@ impl ExchangesWatch {
         }
     }
 
-    /// A request has ended, and its slave was heard.
+    /// A request has ended, and its slave was heard. Returns the slave if it has started.
     fn ended(
         &mut self,
         exchanges: &ExchangesSpec,
@@ -781,7 +781,7 @@ impl ExchangesWatch {
             || exchanges.rows_of(number).any(starts)
     }
 
-    /// Since when the exchange could be executed without a failure on the line; `None` if it cannot now.
+    /// Since when the exchange could be executed, with no failure on the line; `None` if it cannot be executed now.
     pub(super) fn could_ask(&self, exchanges: &ExchangesSpec, row: usize) -> Option<Instant> {
         let number = exchanges.rows[row].slave;
         let (slave, watch) = (self.slaves.get(&number)?, &self.rows[row]);

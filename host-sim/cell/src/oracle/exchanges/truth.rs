@@ -1,4 +1,4 @@
-//! The values that slaves and controller really had, whatever the gateway believes: both ends of the way of each value.
+//! The values that slaves and controller really had, whatever the gateway believes: both ends of each value's route.
 //!
 //! In: what the slaves of a line did, the controller's registers at each step, the requests that the gateway sent and
 //! the replies that it accepted. Out: violations. Does not know timeouts or repetitions.
@@ -53,7 +53,7 @@ struct LineTruth {
     took: BTreeMap<usize, Vec<u8>>,
     /// What was written to the slaves, by slave, coils or registers, and address.
     memory: BTreeMap<(u8, bool, u16), u16>,
-    /// Slaves that have forgotten what was written, and of which the gateway does not know it.
+    /// Slaves that have forgotten what was written, unknown to the gateway.
     forgot: BTreeSet<u8>,
     /// The values that each variable had at its slave.
     held: BTreeMap<usize, VecDeque<(Instant, Raw)>>,
@@ -97,7 +97,7 @@ impl Truth {
 
     /// Reports the current variables of the controller.
     pub(in crate::oracle) fn sees_controller(&mut self, image: &[u8], now: Instant) {
-        // Most steps of a cell do not change them.
+        // Most steps of a cell change none of these variables.
         if !self.seen.is_empty() && image[self.seen_from..].starts_with(&self.seen) {
             return;
         }
@@ -152,7 +152,7 @@ impl Truth {
         }
     }
 
-    /// Whether a frame since then may be corrupted although its CRC is valid.
+    /// Whether a frame after `since` may be corrupted although its CRC is valid.
     fn is_excused(&self, port: usize, since: Instant) -> bool {
         let line = self.lines.get(&port);
         line.and_then(|line| line.garbled).is_some_and(|at| at + GARBLED >= since)
@@ -270,7 +270,7 @@ impl Truth {
         self.were_had(spec, &spec.ports[nth], row, values, at, stalled(at))
     }
 
-    /// Checks that the controller had the values of a request at the same time, no longer before it than promised.
+    /// Checks that the controller had the values of a request at the same time, at most the promised time before it.
     fn were_had(
         &self,
         spec: &Spec,
@@ -432,7 +432,7 @@ impl Truth {
 }
 
 impl LineTruth {
-    /// The data of a writing exchange that its slave has, in the form of a request.
+    /// The data that a slave has for an exchange that writes, in the form of a request.
     fn written(&self, row: &RowSpec) -> Option<Vec<u8>> {
         let address = row.written?;
         let there =
@@ -461,7 +461,7 @@ fn fields(row: &RowSpec) -> Vec<(&FieldSpec, std::ops::Range<usize>)> {
     }
 }
 
-/// Whether these bytes of a field are what this value of its variable is sent as.
+/// Whether these bytes of a field represent this value of its variable.
 fn agrees(field: &FieldSpec, var: SysVar, raw: Raw, bytes: &[u8]) -> bool {
     let (encoding, overflow, from) = match *field {
         FieldSpec::DeviceOutput { encoding, overflow, from } => (encoding, overflow, from),
@@ -527,7 +527,7 @@ fn come_together(spec: &Spec, row: &RowSpec) -> bool {
 const ON_THE_LINE: Duration = Duration::from_millis(250);
 /// A poll is given up after this time.
 const POLLED: Duration = Duration::from_millis(500);
-/// More than the delay of data in a stream.
+/// Longer than any delay of data in a stream.
 const STREAMED: Duration = Duration::from_secs(10);
 /// A longer stall of the gateway counts as sleep.
 const STALL: Duration = Duration::from_millis(500);
