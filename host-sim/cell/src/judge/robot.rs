@@ -101,8 +101,8 @@ impl Robot {
         }
     }
 
-    /// How long data that the gateway has sent since then may have waited in the transport. A gateway that is not called
-    /// cannot withdraw it.
+    /// How long data that the gateway has sent since then may have waited in the transport. A gateway that is not
+    /// called cannot withdraw it.
     pub(super) fn transport(&self, rules: &Rules, since: Instant) -> Duration {
         if self.not_called >= since { rules.transport } else { Duration::ZERO }
     }
@@ -137,8 +137,8 @@ impl Robot {
         let conn = self.conns.entry(id).or_default();
         conn.came.extend_from_slice(bytes);
         while let Some(frame) = next_frame(&mut conn.came) {
-            // The gateway has one request in flight, and gives it up after half a second. A new request before then shows
-            // that it has received the reply.
+            // The gateway has one request in flight, and gives it up after half a second. A new request before then
+            // shows that it has received the reply.
             let before = conn.newest.replace(now);
             if let Some(before) = before.filter(|before| now.saturating_since(*before) < SURELY_TAKEN) {
                 for nth in conn.open.drain(..) {

@@ -827,5 +827,6 @@ pub(super) fn name(row: &RowSpec) -> String {
 
 /// A free line is not idle for longer than this while a request is due.
 const IDLE: Duration = Duration::from_millis(5);
-/// No wait of a slave or an exchange is longer than this, or than twice the timeout if that is more.
+/// No wait of a slave or an exchange is longer than this, or than twice the timeout if that is more. Then it is
+/// probed if the line has a gap.
 const LONGEST_WAIT: Duration = Duration::from_secs(30);

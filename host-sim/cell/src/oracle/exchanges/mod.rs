@@ -153,7 +153,7 @@ impl Oracle {
         self.take_can(nth, verdict, now);
     }
 
-    /// The gateway has noticed that this slave has started, if any.
+    /// Notes that a slave, if any, has started, and that the gateway knows it.
     fn started(&mut self, nth: usize, slave: Option<u8>) {
         if let Some(slave) = slave {
             self.truth.started(nth, slave);
