@@ -13,7 +13,9 @@ macro_rules! page {
     };
 }
 
-/// [driver]: driver [wire]: wire [command]: wire::command
+/// [driver]: driver
+/// [wire]: wire
+/// [command]: wire::command
 #[doc = ""]
 #[doc = include_str!("../docs/engine.md")]
 pub mod engine {}
@@ -23,8 +25,14 @@ pub mod engine {}
 #[doc = include_str!("../docs/driver.md")]
 pub mod driver {}
 
-/// [engine]: engine [sysvars]: wire::sysvars [recipes]: wire::recipes [state]: wire::state [command]: wire::command
-/// [modbus]: wire::modbus [modbus_rtu]: wire::modbus_rtu [slcan]: wire::slcan
+/// [engine]: engine
+/// [sysvars]: wire::sysvars
+/// [recipes]: wire::recipes
+/// [state]: wire::state
+/// [command]: wire::command
+/// [modbus]: wire::modbus
+/// [modbus_rtu]: wire::modbus_rtu
+/// [slcan]: wire::slcan
 #[doc = ""]
 #[doc = include_str!("../docs/wire/README.md")]
 pub mod wire {
@@ -35,7 +43,8 @@ pub mod wire {
     page!(modbus: sysvars modbus_rtu);
     page!(slcan: );
 
-    /// [modbus]: modbus [engine]: super::engine
+    /// [modbus]: modbus
+    /// [engine]: super::engine
     #[doc = ""]
     #[doc = include_str!("../docs/wire/modbus-rtu.md")]
     pub mod modbus_rtu {}

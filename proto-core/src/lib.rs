@@ -12,7 +12,8 @@
     )
 )]
 // The first definition of a link wins: in this documentation the one here, elsewhere that of README.md (to docs.rs).
-//! [`docs::driver`]: crate::docs::driver [`docs::wire`]: crate::docs::wire
+//! [`docs::driver`]: crate::docs::driver
+//! [`docs::wire`]: crate::docs::wire
 //!
 #![doc = include_str!("../README.md")]
 
