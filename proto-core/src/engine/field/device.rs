@@ -8,7 +8,7 @@ use heapless::Vec;
 
 use super::bindings::{InputBind, Outputs};
 use super::codec::{Codec, DeviceCodec, MAX_DEVICE_FRAMES, Reader};
-use super::format::{DeviceFormat, judge, judge_can, probe, probe_all};
+use super::format::{DeviceFormat, judge, judge_can, probe_all};
 use super::frames::{Accepted, FrameContext};
 use super::outgoing::Outgoing;
 use super::output::FieldFrame;
@@ -16,7 +16,7 @@ use super::port::{FieldPort, came, keep_why};
 use super::sender::{DIGEST_SEED, digest};
 use super::texts::{MAX_TEXTS, texts_of};
 use crate::config::{CanFramePart, ConfigView, Counted, DeviceFrame, Parts, Recipe, Rs485, Span};
-use crate::device::{Cutter, Found, Framer, Piece, Probe};
+use crate::device::{Cutter, Found, Framer, Piece};
 use crate::engine::build_error::{BuildError, one_too_many};
 use crate::engine::counters::{add, bump};
 use crate::engine::link::command::CommandLink;
@@ -98,8 +98,7 @@ fn found_by_search<'f, 'b>(
 ) -> (&'b [u8], AsFormat<'f>) {
     match found {
         Found::Frame(frame) => {
-            let is_this = |format: &&DeviceFormat| matches!(probe(format, bindings, frame), Probe::Frame(len) if len == frame.len());
-            let found = (0..).zip(formats).find(|(_, format)| is_this(format));
+            let found = (0..).zip(formats).find(|(_, format)| format.is_frame(bindings, frame));
             (frame, found.ok_or(Rejection::NoFrame))
         }
         Found::Other(frame) => (frame, Err(Rejection::OtherDevice)),
@@ -144,10 +143,7 @@ impl FieldPort {
         };
         let formats = formats.get(..usize::from(*inputs)).unwrap_or(&[]);
         let tail = formats.first().map_or(&[][..], |format| format.layout.tail());
-        let effort = formats
-            .iter()
-            .map(|format| format.layout.lengths().1.saturating_add(usize::from(format.bindings.len)))
-            .fold(0, usize::saturating_add);
+        let effort = formats.iter().map(DeviceFormat::effort).fold(0, usize::saturating_add);
         let (reply, counters) = (&mut self.reply, &mut self.counters);
         let mut frames = FrameContext::new((self.id, self.mode), reply, counters, bindings, store, commands);
         if let Reader::Whole { heard, .. } = reader

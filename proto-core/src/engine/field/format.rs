@@ -18,6 +18,18 @@ pub(crate) struct DeviceFormat {
     pub bindings: Span,
 }
 
+impl DeviceFormat {
+    /// About how many steps it takes to see that bytes are not this frame.
+    pub(crate) fn effort(&self) -> usize {
+        self.layout.lengths().1.saturating_add(usize::from(self.bindings.len))
+    }
+
+    /// Whether a frame that was found is this one.
+    pub(crate) fn is_frame(&self, bindings: &[InputBind], frame: &[u8]) -> bool {
+        probe(self, bindings, frame) == Probe::Frame(frame.len())
+    }
+}
+
 /// Matches bytes against all formats: a frame takes precedence over a partial frame, and a partial frame over a wrong
 /// checksum.
 pub(crate) fn probe_all(formats: &[DeviceFormat], bindings: &[InputBind], bytes: &[u8]) -> Probe {

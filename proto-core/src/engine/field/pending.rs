@@ -124,15 +124,12 @@ impl<'i> PendingReplies<'i> {
 
     /// Rough number of steps to see that bytes are none of the frames that may arrive.
     pub(crate) fn effort(&self) -> usize {
-        let effort = |format: &DeviceFormat| {
-            format.layout.lengths().1.saturating_add(usize::from(format.bindings.len))
-        };
-        self.all().map(effort).fold(MAX_ADU, usize::saturating_add)
+        self.all().map(DeviceFormat::effort).fold(MAX_ADU, usize::saturating_add)
     }
 
     /// The meaning of a frame that [`Self::probe`] has found.
     pub(crate) fn heard(&self, frame: &[u8]) -> Option<Heard<'i>> {
-        let is = |format: &DeviceFormat| matches!(probe(format, self.bindings, frame), Probe::Frame(len) if len == frame.len());
+        let is = |format: &DeviceFormat| format.is_frame(self.bindings, frame);
         let is_echo = self.echo.is_some_and(|echo| echo.probe(frame) == Probe::Frame(frame.len()));
         if is_echo && self.has_echo {
             return Some(Heard::Echo);
