@@ -26,7 +26,7 @@ pub(crate) fn examine(case: &Case<'_>, findings: &mut Vec<Finding>) {
     {
         let place = FindingPlace::Controller;
         let expected = "remote or automatic mode, powered and enabled: the file has commands";
-        findings.push(place.found(Severity::Warning, cause, seen, expected, likely, remedy));
+        findings.push(place.warning(cause, seen, expected, likely, remedy));
     }
 }
 

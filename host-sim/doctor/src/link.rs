@@ -247,8 +247,7 @@ impl LinkCase<'_> {
     fn strangers(&self) -> Option<Finding> {
         let strangers = self.facts.map_or(0, |facts| facts.strangers);
         (strangers > 0 && !self.is_up()).then(|| {
-            self.place.found(
-                Severity::Fault,
+            self.place.fault(
                 Cause::Stranger,
                 format!("{strangers} connections or datagrams from other addresses"),
                 format!("the controller at {}", self.info.host),
