@@ -5,7 +5,7 @@ use proto_core::config::GatewayConfig;
 use proto_core::engine::{Engine, Input, Output};
 use proto_core::record::{Entry, MAGIC, totals};
 use proto_core::time::Instant;
-use recipe_config::board::image_of;
+use recipe_config::board::encoded;
 
 /// A recording in progress.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ pub(super) struct Recorder {
 impl Recorder {
     /// A recording of an engine with this configuration.
     pub(super) fn new(config: &GatewayConfig) -> Self {
-        let image = image_of(config).expect("it was checked");
+        let image = encoded(config).expect("there is room for every configuration");
         let mut recorder = Self { image, bytes: MAGIC.to_vec() };
         recorder.start();
         recorder

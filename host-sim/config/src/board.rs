@@ -9,15 +9,23 @@ use std::str::FromStr;
 use proto_core::config::{Bus, GatewayConfig, image};
 use proto_core::engine::Engine;
 
-/// The image of a configuration (docs/configuration.md section 6), which this program has decoded again: what a board
-/// would refuse is never stored or sent.
+/// The bytes of a configuration's image (docs/configuration.md section 6).
 ///
 /// # Errors
-/// The text for people: it is longer than [`image::MAX_IMAGE`], or a board would refuse it.
-pub fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
+/// The text for people, if it is longer than [`image::MAX_IMAGE`].
+pub fn encoded(config: &GatewayConfig) -> Result<Vec<u8>, String> {
     let mut bytes = vec![0; image::MAX_IMAGE];
     let len = image::encode(config, &mut bytes).map_err(|error| error.to_string())?;
     bytes.truncate(len);
+    Ok(bytes)
+}
+
+/// Same as [`encoded`], and decoded again: what a board would refuse is never stored or sent.
+///
+/// # Errors
+/// The text for people: it is too long, or a board would refuse it.
+pub fn image_of(config: &GatewayConfig) -> Result<Vec<u8>, String> {
+    let bytes = encoded(config)?;
     image::decode(&bytes).map_err(|error| error.to_string())?;
     Ok(bytes)
 }

@@ -7,13 +7,14 @@ use std::path::Path;
 use mcap::WriteOptions;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
-use proto_core::config::{GatewayConfig, image};
+use proto_core::config::GatewayConfig;
 use proto_core::engine::{Engine, Input, LinkId, OUTPUT_BUFFER, Output, PortId};
 use proto_core::record::{Entry, MAGIC, totals};
 use proto_core::time::{Duration, Instant};
 use proto_core::wire::can::{CanFrame, CanId};
 use recipe_capture::recording::{ENGINE, ENGINE_ENCODING};
 use recipe_capture::replay::{ReplayError, Report, Stopped, replay};
+use recipe_config::board;
 use recipe_config::file::{Text, parse_gateway};
 use recipe_fuzz::source::Source;
 
@@ -95,10 +96,9 @@ fn check(file: &Path) {
 fn record(input: &mut Source<'_>) -> Vec<Vec<u8>> {
     let text = Text { name: "cell.toml", toml: input.one_of(&FILES) };
     let config: Box<GatewayConfig> = parse_gateway(text, &[]).expect("an example");
-    let mut bytes = vec![0; image::MAX_IMAGE];
-    let len = image::encode(&*config, &mut bytes).expect("there is room");
+    let image = board::encoded(&config).expect("there is room");
     let mut engine = Box::new(Engine::<8, 4, 512>::new(&*config).expect("an example"));
-    let mut calls = vec![encoded(&[Entry::Start { image: &bytes[..len] }])];
+    let mut calls = vec![encoded(&[Entry::Start { image: &image }])];
     let mut now = Instant::from_millis(1_000);
     for _ in 0..input.below(12) {
         now += Duration::from_millis(u64::from(input.u8()));

@@ -10,7 +10,7 @@ use proto_core::config::{Bus, GatewayConfig, Parts, Port as PortConfig};
 use proto_core::engine::{Endpoint as To, LinkKind, PortId, Transport};
 use proto_core::sysvar::Direction;
 use proto_core::time::Instant;
-use recipe_config::board::image_of;
+use recipe_config::board::encoded;
 use serde_json::json;
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::sync::Notify;
@@ -148,7 +148,7 @@ fn begin_tapping(
     let at = now();
     let cell = Watched::new(config, engine, Epoch { at, wall: SystemTime::now() }, Arc::clone(decoder));
     // Only recordings start with the image; a long configuration has none.
-    let image = watch.wanted().passes.then(|| image_of(config)).transpose().map_err(RunError::new)?;
+    let image = watch.wanted().passes.then(|| encoded(config)).transpose().map_err(RunError::new)?;
     Tapping::begin(watch, cell, at, image.as_deref())
         .map_err(|error| RunError::new(format!("cannot start a thread: {error}")))
 }
